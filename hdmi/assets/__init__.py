@@ -1,0 +1,20 @@
+"""Robot and object models, built with MjSpec from plain tables of figures."""
+
+from hdmi.assets.objects import GeomConfig, HingeConfig, ObjectConfig, SceneryConfig
+from hdmi.assets.robot import RobotConfig, default_joint_pos, match_names, per_joint
+from hdmi.assets.scene import Effector, Scene, SimConfig, build_scene
+
+__all__ = [
+    "Effector",
+    "GeomConfig",
+    "HingeConfig",
+    "ObjectConfig",
+    "RobotConfig",
+    "Scene",
+    "SceneryConfig",
+    "SimConfig",
+    "build_scene",
+    "default_joint_pos",
+    "match_names",
+    "per_joint",
+]

@@ -1,0 +1,225 @@
+"""A scene: floor, robot, object, scenery and the sensors that the environment reads, compiled to one MjModel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+from hdmi.assets import g1
+from hdmi.assets.objects import ObjectConfig, SceneryConfig, add_object, add_scenery
+from hdmi.assets.robot import ROBOT_BIT, WORLD_BIT, RobotConfig, add_robot, default_joint_pos
+
+Pose = tuple[Sequence[float], Sequence[float]]
+_NETFORCE = 3  # contact sensor reduction: sum of all matching contacts, in the world frame
+
+
+@dataclass(frozen=True)
+class SimConfig:
+    """Physics of the scene.
+
+    Args:
+        timestep: of physics, s.
+        decimation: physics steps per control step.
+        integrator, cone: MuJoCo's; Euler treats joint damping implicitly.
+        iterations, ls_iterations: of the constraint solver.
+    """
+
+    timestep: float = 0.005
+    decimation: int = 4
+    integrator: Literal["euler", "implicitfast"] = "euler"
+    cone: Literal["pyramidal", "elliptic"] = "pyramidal"
+    iterations: int = 10
+    ls_iterations: int = 20
+
+    @property
+    def control_dt(self) -> float:
+        """Seconds per control step."""
+        return self.timestep * self.decimation
+
+
+@dataclass(frozen=True)
+class Effector:
+    """An end effector that is meant to touch the object.
+
+    Args:
+        body: of the robot.
+        point: on that body, in its frame, m.
+        target: on the object's link, in its frame, m; the reference motion's contact points take precedence.
+    """
+
+    body: str
+    point: Sequence[float] = (0.0, 0.0, 0.0)
+    target: Sequence[float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A compiled scene and where its parts are in MuJoCo's arrays."""
+
+    model: mujoco.MjModel
+    sim: SimConfig
+    effectors: tuple[Effector, ...]
+    body_ids: np.ndarray  # [B] robot bodies in table order
+    joint_qpos: np.ndarray  # [J] addresses
+    joint_dof: np.ndarray  # [J]
+    foot_sensors: np.ndarray  # [2, 3] addresses in sensordata
+    effector_sensors: np.ndarray  # [E, 3]
+    object_body: int | None
+    object_link: int | None  # the body that contact points are fixed to
+    object_free_qpos: int | None  # address of the free joint; None when fixed or absent
+    object_free_dof: int | None
+    object_hinge_qpos: int | None
+    object_hinge_dof: int | None
+    object_geoms: np.ndarray  # ids
+
+    @property
+    def num_object_joints(self) -> int:
+        return 0 if self.object_hinge_qpos is None else 1
+
+
+def build_scene(
+    robot: RobotConfig,
+    sim: SimConfig,
+    object: ObjectConfig | None = None,
+    scenery: Sequence[SceneryConfig] = (),
+    effectors: Sequence[Effector] = (),
+    placements: Mapping[str, Pose] | None = None,
+) -> Scene:
+    """Composes and compiles a scene.
+
+    Args:
+        placements: body name -> (pos, quat), from the reference's first frame, for the object and scenery.
+
+    Raises:
+        ValueError: if scenery has no placement, an effector names no robot body, or effectors have no object.
+    """
+    placements = placements or {}
+    for effector in effectors:
+        if effector.body not in g1.BODY_NAMES:
+            raise ValueError(f"effectors: robot has no body {effector.body!r}; it has {list(g1.BODY_NAMES)}")
+    if effectors and object is None:
+        raise ValueError("effectors: the task has no object to touch")
+    spec = mujoco.MjSpec()
+    _set_options(spec, sim)
+    _add_floor(spec)
+    add_robot(spec, robot)
+    if object is not None:
+        add_object(spec, object, *placements.get(object.name, ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))))
+    for item in scenery:
+        if item.name in placements:
+            add_scenery(spec, item, *placements[item.name])
+        elif item.pos is not None:
+            add_scenery(spec, item, item.pos, item.quat)
+        else:
+            raise ValueError(f"scenery {item.name!r}: the reference has no body of that name; give it a pos")
+    _add_contact_sensors(spec, object, effectors)
+    model = spec.compile()
+
+    joint_ids = [model.joint(name).id for name in g1.JOINT_NAMES]
+    model.qpos0[2] = g1.ROOT_HEIGHT
+    model.qpos0[model.jnt_qposadr[joint_ids]] = default_joint_pos()
+    link = None if object is None else model.body(object.link).id
+    hinge = None if object is None or object.hinge is None else model.joint(object.hinge.name).id
+    free = None if object is None or object.fixed_base else model.joint("object_root").id
+    body = None if object is None else model.body(object.name).id
+    return Scene(
+        model=model,
+        sim=sim,
+        effectors=tuple(effectors),
+        body_ids=np.array([model.body(name).id for name in g1.BODY_NAMES]),
+        joint_qpos=model.jnt_qposadr[joint_ids].copy(),
+        joint_dof=model.jnt_dofadr[joint_ids].copy(),
+        foot_sensors=_sensor_addresses(model, [f"{foot}_force" for foot in g1.FEET]),
+        effector_sensors=_sensor_addresses(model, [f"effector{i}_force" for i in range(len(effectors))]),
+        object_body=body,
+        object_link=link,
+        object_free_qpos=None if free is None else int(model.jnt_qposadr[free]),
+        object_free_dof=None if free is None else int(model.jnt_dofadr[free]),
+        object_hinge_qpos=None if hinge is None else int(model.jnt_qposadr[hinge]),
+        object_hinge_dof=None if hinge is None else int(model.jnt_dofadr[hinge]),
+        object_geoms=np.flatnonzero(np.isin(model.geom_bodyid, [b for b in (body, link) if b is not None])),
+    )
+
+
+def _set_options(spec: mujoco.MjSpec, sim: SimConfig) -> None:
+    integrators = {
+        "euler": mujoco.mjtIntegrator.mjINT_EULER,
+        "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    }
+    cones = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+    if sim.integrator not in integrators:
+        raise ValueError(f"sim.integrator: expected one of {list(integrators)}, got {sim.integrator!r}")
+    if sim.cone not in cones:
+        raise ValueError(f"sim.cone: expected one of {list(cones)}, got {sim.cone!r}")
+    spec.option.timestep = sim.timestep
+    spec.option.integrator = integrators[sim.integrator]
+    spec.option.cone = cones[sim.cone]
+    spec.option.iterations = sim.iterations
+    spec.option.ls_iterations = sim.ls_iterations
+    # A diverged world must be seen and reset by the environment, not silently by MuJoCo.
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+
+
+def _add_floor(spec: mujoco.MjSpec) -> None:
+    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
+    spec.visual.headlight.diffuse = [0.35, 0.35, 0.35]
+    spec.visual.headlight.specular = [0.0, 0.0, 0.0]
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1920, 1080
+    spec.visual.quality.shadowsize = 4096
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.93, 0.95, 0.98],
+        rgb2=[0.62, 0.70, 0.80],
+        width=256,
+        height=256,
+    )
+    spec.add_texture(
+        name="checker",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.78, 0.80, 0.82],
+        rgb2=[0.70, 0.72, 0.75],
+        width=512,
+        height=512,
+    )
+    material = spec.add_material(name="checker", texrepeat=[2, 2], texuniform=True, reflectance=0.05)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "checker"
+    spec.worldbody.add_light(
+        pos=[1.5, -2.0, 5.0], dir=[-0.25, 0.35, -0.9], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        diffuse=[0.6, 0.6, 0.6], castshadow=True,
+    )  # fmt: skip
+    spec.worldbody.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.5], material="checker",
+        contype=WORLD_BIT, conaffinity=ROBOT_BIT | WORLD_BIT, condim=3, friction=[1.0, 0.005, 0.0001],
+    )  # fmt: skip
+
+
+def _add_contact_sensors(
+    spec: mujoco.MjSpec, object: ObjectConfig | None, effectors: Sequence[Effector]
+) -> None:
+    force = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+    common = {"type": mujoco.mjtSensor.mjSENS_CONTACT, "intprm": [force, _NETFORCE, 1]}
+    for foot in g1.FEET:
+        spec.add_sensor(name=f"{foot}_force", objtype=mujoco.mjtObj.mjOBJ_BODY, objname=foot, **common)
+    for i, effector in enumerate(effectors):
+        assert object is not None
+        # XBODY is the whole subtree: for an articulated object its base and its link
+        spec.add_sensor(
+            name=f"effector{i}_force",
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            objname=effector.body,
+            reftype=mujoco.mjtObj.mjOBJ_XBODY,
+            refname=object.name,
+            **common,
+        )
+
+
+def _sensor_addresses(model: mujoco.MjModel, names: Sequence[str]) -> np.ndarray:
+    starts = np.array([model.sensor(name).adr[0] for name in names], dtype=int)
+    return starts[:, None] + np.arange(3)  # [S, 3]

@@ -1,0 +1,309 @@
+"""The base environment: raw physics state of a robot, an object and their contacts, for N worlds at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Composite, Unbounded, UnboundedDiscrete
+from torchrl.envs import EnvBase
+
+from hdmi.assets import Scene, g1
+from hdmi.envs.backend import BatchBackend, PhysicsBackend
+from hdmi.envs.rendering import WorldRenderer
+from hdmi.functional import body_velocity, quat_apply_inverse
+
+# Model fields of which `set_const` must know.
+_SET_CONST_FIELDS = frozenset(mujoco.MjModel._setconst_inputs)
+
+
+class HumanoidObjectEnv(EnvBase):
+    """N worlds of one scene as a batch-locked TorchRL environment of raw state.
+
+    There is no reward and no task here: transforms add them. `terminated` is set only for a world whose physics
+    diverged; that world is put back into the default state at once and counted in `num_diverged`.
+
+    Action:
+        `action`: joint position targets, rad. [N, 29], held for the control step; or [N, S, 29], one after
+        another for decimation / S physics steps each.
+
+    Writes (float32, world frame, quaternions wxyz; B = 30 bodies, K object joints, E effectors):
+        `robot/{joint_pos, joint_vel, joint_torque, joint_target}` [N, 29];
+        `robot/{body_pos, body_lin_vel, body_ang_vel}` [N, B, 3]; `robot/body_quat` [N, B, 4];
+        `robot/foot_force` [N, 2, 3], N;
+        with an object: `object/{pos, lin_vel, ang_vel, link_pos}` [N, 3], `object/{quat, link_quat}` [N, 4] (the
+        link carries the contact points; for a rigid object it is the object), `object/{joint_pos, joint_vel}`
+        [N, K], `object/{scale, mass, friction}` [N, 1]; `contact/force` [N, E, 3], N;
+        `diverged` bool [N, 1]; `pixels` uint8 [N, H, W, 3] if asked for.
+
+    Reads on reset, all optional, under `init`: `root_pos`, `root_quat`, `root_lin_vel`, `root_ang_vel` (world),
+        `joint_pos`, `joint_vel`, `object_pos`, `object_quat`, `object_lin_vel`, `object_ang_vel`,
+        `object_joint_pos`, `object_joint_vel`, `object_scale` [N, 1], and `model/<MjModel field>` [N, ...].
+        What is not given is the model's default.
+
+    Args:
+        scene: compiled by `hdmi.assets.build_scene`.
+        num_envs: N.
+        backend: makes a physics backend from a model and N; MuJoCo's CPU `Batch` by default.
+        pixels: (height, width) to add rendered `pixels`.
+    """
+
+    batch_locked = True
+
+    def __init__(
+        self,
+        scene: Scene,
+        num_envs: int,
+        backend: Callable[[mujoco.MjModel, int], PhysicsBackend] = BatchBackend,
+        pixels: tuple[int, int] | None = None,
+    ):
+        self.backend = backend(scene.model, num_envs)
+        super().__init__(device=self.backend.device, batch_size=[num_envs])
+        self.scene = scene
+        self.num_diverged = 0
+        self._pixels = pixels
+        self._renderer: WorldRenderer | None = None
+        model = scene.model
+        self._object_scale = torch.ones(num_envs, 1)
+        self._geom_base = {f: torch.from_numpy(getattr(model, f).copy()) for f in ("geom_size", "geom_pos")}
+        self._qpos0 = torch.from_numpy(model.qpos0.copy())
+        self._joint_qpos = _slice(scene.joint_qpos)
+        self._joint_dof = _slice(scene.joint_dof)
+        self._body = _slice(scene.body_ids)
+        self._make_specs()
+
+    @property
+    def num_envs(self) -> int:
+        """Number of worlds."""
+        return self.batch_size[0]
+
+    # -- specs ------------------------------------------------------------------------------------------------
+
+    def _make_specs(self) -> None:
+        n, scene = self.num_envs, self.scene
+        joints, bodies, effectors = len(g1.JOINT_NAMES), len(g1.BODY_NAMES), len(scene.effectors)
+
+        def unbounded(*shape: int) -> Unbounded:
+            return Unbounded(shape=(n, *shape), device=self.device, dtype=torch.float32)
+
+        robot = {key: unbounded(joints) for key in ("joint_pos", "joint_vel", "joint_torque", "joint_target")}
+        robot |= {key: unbounded(bodies, 3) for key in ("body_pos", "body_lin_vel", "body_ang_vel")}
+        robot |= {"body_quat": unbounded(bodies, 4), "foot_force": unbounded(2, 3)}
+        spec: dict[str, object] = {"robot": Composite(robot, shape=(n,))}
+        if scene.object_body is not None:
+            k = scene.num_object_joints
+            spec["object"] = Composite(
+                {key: unbounded(3) for key in ("pos", "lin_vel", "ang_vel", "link_pos")}
+                | {key: unbounded(4) for key in ("quat", "link_quat")}
+                | {key: unbounded(k) for key in ("joint_pos", "joint_vel")}
+                | {key: unbounded(1) for key in ("scale", "mass", "friction")},
+                shape=(n,),
+            )
+            spec["contact"] = Composite({"force": unbounded(effectors, 3)}, shape=(n,))
+        spec["diverged"] = Binary(n=1, shape=(n, 1), dtype=torch.bool, device=self.device)
+        if self._pixels is not None:
+            spec["pixels"] = UnboundedDiscrete(shape=(n, *self._pixels, 3), dtype=torch.uint8, device=self.device)
+        self.observation_spec = Composite(spec, shape=(n,))
+        self.action_spec = unbounded(joints)
+        self.reward_spec = unbounded(1)
+        self.done_spec = Composite(
+            {
+                key: Binary(n=1, shape=(n, 1), dtype=torch.bool, device=self.device)
+                for key in ("done", "terminated", "truncated")
+            },
+            shape=(n,),
+        )
+
+    # -- stepping ---------------------------------------------------------------------------------------------
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict.get("action")
+        targets = action.unsqueeze(-2) if action.ndim == 2 else action  # [N, S, 29]
+        decimation, count = self.scene.sim.decimation, targets.shape[-2]
+        if decimation % count:
+            raise ValueError(f"action: {count} targets per control step do not divide the decimation {decimation}")
+        ctrl = self.backend.data("ctrl")
+        for s in range(count):
+            ctrl.copy_(targets[:, s])
+            self.backend.step(decimation // count)
+        failed = self.backend.failed()
+        if failed.any():
+            self.num_diverged += int(failed.sum())
+            self._reset_worlds(failed, None)
+        out = self._state()
+        terminated = failed.unsqueeze(-1)
+        out.set("diverged", terminated)
+        out.set("reward", torch.zeros(self.num_envs, 1, device=self.device))
+        out.set("terminated", terminated.clone())
+        out.set("truncated", torch.zeros_like(terminated))
+        out.set("done", terminated.clone())
+        return out
+
+    def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        init = None if tensordict is None else tensordict.get("init", None)
+        self._reset_worlds(mask.reshape(-1), init)
+        out = self._state()
+        no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+        for key in ("diverged", "done", "terminated", "truncated"):
+            out.set(key, no.clone())
+        return out
+
+    def _set_seed(self, seed: int | None) -> None:
+        # physics is deterministic; what is random is drawn by transforms from torch's generator
+        if seed is not None:
+            torch.manual_seed(seed)
+
+    def get_state(self) -> TensorDict:
+        """Everything that determines the future of all worlds: state and randomized model fields."""
+        return TensorDict(
+            {"backend": TensorDict(self.backend.get_state()), "object_scale": self._object_scale.clone()}
+        )
+
+    def set_state(self, state: TensorDictBase) -> None:
+        """Restores what `get_state` returned."""
+        self._object_scale.copy_(state["object_scale"])
+        self.backend.set_state(dict(state["backend"].items()))
+
+    # -- reset ------------------------------------------------------------------------------------------------
+
+    def _reset_worlds(self, mask: Tensor, init: TensorDictBase | None) -> None:
+        """Puts masked worlds into the model's default state, overwritten by what `init` gives."""
+        backend, scene = self.backend, self.scene
+        init = TensorDict({}, batch_size=self.batch_size) if init is None else init
+        self._write_model(mask, init)
+        backend.reset(mask)
+        qpos, qvel = self._qpos0.expand(self.num_envs, -1).clone(), torch.zeros_like(backend.data("qvel"))
+
+        def write(target: Tensor, where: slice | int | None, key: str) -> None:
+            value = init.get(key, None)
+            if value is not None and where is not None:
+                target[:, where] = value.to(target.dtype)
+
+        write(qpos, slice(0, 3), "root_pos")
+        write(qpos, slice(3, 7), "root_quat")
+        write(qvel, slice(0, 3), "root_lin_vel")
+        write(qvel, slice(3, 6), "root_ang_vel")
+        write(qpos, self._joint_qpos, "joint_pos")
+        write(qvel, self._joint_dof, "joint_vel")
+        # MuJoCo's free joints turn in the body frame
+        qvel[:, 3:6] = quat_apply_inverse(qpos[:, 3:7], qvel[:, 3:6])
+        if (q := scene.object_free_qpos) is not None and (v := scene.object_free_dof) is not None:
+            write(qpos, slice(q, q + 3), "object_pos")
+            write(qpos, slice(q + 3, q + 7), "object_quat")
+            write(qvel, slice(v, v + 3), "object_lin_vel")
+            write(qvel, slice(v + 3, v + 6), "object_ang_vel")
+            qvel[:, v + 3 : v + 6] = quat_apply_inverse(qpos[:, q + 3 : q + 7], qvel[:, v + 3 : v + 6])
+        if (q := scene.object_hinge_qpos) is not None and (v := scene.object_hinge_dof) is not None:
+            write(qpos, slice(q, q + 1), "object_joint_pos")
+            write(qvel, slice(v, v + 1), "object_joint_vel")
+
+        backend.data("qpos")[mask] = qpos[mask]
+        backend.data("qvel")[mask] = qvel[mask]
+        backend.data("ctrl")[mask] = qpos[mask][:, self._joint_qpos]
+        backend.refresh(mask)
+
+    def _write_model(self, mask: Tensor, init: TensorDictBase) -> None:
+        commit = False
+        fields = init.get("model", None)
+        for field, value in () if fields is None else fields.items():
+            self.backend.model(field)[mask] = value[mask].double()
+            commit |= field in _SET_CONST_FIELDS
+        scale = init.get("object_scale", None)
+        if scale is not None:
+            self._object_scale[mask] = scale[mask]
+            geoms = torch.from_numpy(self.scene.object_geoms)
+            for field, base in self._geom_base.items():
+                rows = self.backend.model(field)
+                rows[mask.nonzero(), geoms] = base[geoms] * scale[mask].double().unsqueeze(-1)
+            commit = True
+        if commit:
+            self.backend.commit_model(mask)
+
+    # -- reading ----------------------------------------------------------------------------------------------
+
+    def _state(self) -> TensorDict:
+        """Copies the live arrays into fresh float32 tensors: collectors keep references to what they are given."""
+        read, scene = self._read, self.scene
+        xpos, xquat = read("xpos"), read("xquat")  # [N, nbody, *]
+        lin_vel, ang_vel = body_velocity(
+            read("cvel"), xpos, read("subtree_com")[:, torch.from_numpy(scene.model.body_rootid)]
+        )
+        qpos, qvel, sensors = read("qpos"), read("qvel"), read("sensordata")
+        joint_vel = qvel[:, self._joint_dof]
+        damping = torch.from_numpy(scene.model.dof_damping[scene.joint_dof]).float()
+        robot = {
+            "joint_pos": qpos[:, self._joint_qpos],
+            "joint_vel": joint_vel,
+            # the servo's derivative gain is the joint's damping
+            "joint_torque": read("actuator_force") - damping * joint_vel,
+            "joint_target": read("ctrl"),
+            "body_pos": xpos[:, self._body],
+            "body_quat": xquat[:, self._body],
+            "body_lin_vel": lin_vel[:, self._body],
+            "body_ang_vel": ang_vel[:, self._body],
+            "foot_force": sensors[:, torch.from_numpy(scene.foot_sensors)],
+        }
+        n, bs = self.num_envs, self.batch_size
+        state = {"robot": TensorDict(robot, batch_size=bs, device=self.device)}
+        if scene.object_body is not None:
+            body, link = scene.object_body, scene.object_link
+            hinge_q, hinge_v = scene.object_hinge_qpos, scene.object_hinge_dof
+            object_ = {
+                "pos": xpos[:, body],
+                "quat": xquat[:, body],
+                "lin_vel": lin_vel[:, body],
+                "ang_vel": ang_vel[:, body],
+                "link_pos": xpos[:, link],
+                "link_quat": xquat[:, link],
+                "joint_pos": torch.zeros(n, 0) if hinge_q is None else qpos[:, hinge_q : hinge_q + 1],
+                "joint_vel": torch.zeros(n, 0) if hinge_v is None else qvel[:, hinge_v : hinge_v + 1],
+                "scale": self._object_scale.clone(),
+                "mass": self._object_model("body_mass", [body, link]),
+                "friction": self._object_model("geom_friction", [int(scene.object_geoms[-1])]),
+            }
+            force = sensors[:, torch.from_numpy(scene.effector_sensors)]
+            state["object"] = TensorDict(object_, batch_size=bs, device=self.device)
+            state["contact"] = TensorDict({"force": force}, batch_size=bs, device=self.device)
+        out = TensorDict(state, batch_size=bs, device=self.device)
+        if self._pixels is not None:
+            frames = np.stack([self.render(i, *self._pixels) for i in range(n)])
+            out.set("pixels", torch.from_numpy(frames))
+        return out
+
+    def _read(self, field: str) -> Tensor:
+        return self.backend.data(field).to(torch.float32)
+
+    def _object_model(self, field: str, ids: list[int | None]) -> Tensor:
+        rows = self.backend.model(field)[:, sorted({i for i in ids if i is not None})].to(torch.float32)  # [N, i, ...]
+        return rows.sum(-1, keepdim=True) if rows.ndim == 2 else rows[:, -1, :1]
+
+    def render(self, index: int = 0, height: int = 480, width: int = 640) -> np.ndarray:
+        """A picture of one world from a camera that follows the robot. uint8 [height, width, 3]
+
+        Raises:
+            RuntimeError: if no rendering back end works; says what to install.
+        """
+        if self._renderer is None:
+            self._renderer = WorldRenderer(self.scene.model, height, width)
+        model, data = self.backend.world(index)
+        return self._renderer(model, data, height, width)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+        super().close(raise_if_closed=raise_if_closed)
+
+
+def _slice(index: np.ndarray) -> slice:
+    """Consecutive indices as a slice, which reads without gathering."""
+    if not (np.diff(index) == 1).all():
+        raise ValueError(f"expected consecutive addresses, got {index.tolist()}")
+    return slice(int(index[0]), int(index[-1]) + 1)

@@ -1,0 +1,72 @@
+"""Pictures of worlds without a display."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+from mujoco.rendering.classic import gl_context
+
+_HELP = (
+    "no OpenGL for rendering ({error}). Headless Linux: install EGL (Debian: apt-get install libegl1 libgl1-mesa-dri) "
+    "and leave MUJOCO_GL unset or set it to egl; with a display: MUJOCO_GL=glfw"
+)
+
+
+def _choose_gl() -> None:
+    """Falls back to EGL where there is no display and the user has not chosen."""
+    headless = sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if headless and "MUJOCO_GL" not in os.environ:
+        from mujoco.egl import GLContext
+
+        gl_context.GLContext = GLContext  # where Renderer looks it up
+
+
+class WorldRenderer:
+    """Renders worlds of one model with a camera that follows the robot's pelvis.
+
+    Raises:
+        RuntimeError: if no rendering back end works; says what to install.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, height: int = 480, width: int = 640, distance: float = 2.8, azimuth: float = 130.0
+    ):
+        try:
+            _choose_gl()
+            self._renderer = mujoco.Renderer(model, height, width)
+        except Exception as error:
+            raise RuntimeError(_HELP.format(error=error)) from error
+        self._size = (height, width)
+        self._camera = mujoco.MjvCamera()
+        self._camera.distance, self._camera.azimuth, self._camera.elevation = distance, azimuth, -14.0
+        self._option = mujoco.MjvOption()
+        self._option.geomgroup[:] = [1, 1, 1, 0, 0, 0]
+        self._option.sitegroup[:] = 0
+
+    def __call__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        height: int,
+        width: int,
+        draw: Callable[[mujoco.MjvScene], None] | None = None,
+    ) -> np.ndarray:
+        """One picture; `draw` may add geoms to the scene. uint8 [height, width, 3]"""
+        if (height, width) != self._size:
+            self._renderer.close()
+            self._renderer = mujoco.Renderer(model, height, width)
+            self._size = (height, width)
+        pelvis = data.body("pelvis").xpos
+        self._camera.lookat[:] = [pelvis[0], pelvis[1], 0.75]
+        self._renderer.update_scene(data, self._camera, self._option)
+        if draw is not None:
+            draw(self._renderer.scene)
+        return self._renderer.render().copy()
+
+    def close(self) -> None:
+        """Frees the OpenGL context."""
+        self._renderer.close()

@@ -1,0 +1,106 @@
+"""Reward kernels (the paper's reward table). All return [..., 1]; penalties are positive, their weights negative."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+
+def tracking(error: Tensor, *, sigma: float, tolerance: float = 0.0) -> Tensor:
+    """Tracking kernel `exp(-max(mean error - tolerance, 0) / sigma)`.
+
+    Args:
+        error: non-negative errors. [..., K]
+        sigma: error above the tolerance at which the reward has fallen to 1/e, in the error's unit.
+        tolerance: error that costs nothing.
+
+    Returns:
+        Reward in (0, 1]. [..., 1]
+    """
+    return torch.exp(-(error.mean(-1, keepdim=True) - tolerance).clamp(min=0) / sigma)
+
+
+def interaction(
+    eef_pos_w: Tensor,
+    target_pos_w: Tensor,
+    force: Tensor,
+    active: Tensor,
+    *,
+    sigma_pos: float,
+    sigma_frc: float,
+    force_threshold: float,
+    tolerance: float = 0.0,
+    reduce: Literal["mean", "max"] = "mean",
+) -> Tensor:
+    """Reward for touching the object where and when the reference does (section III-B-3).
+
+    Proximity `exp(-|p_eef - p_target| / sigma_pos)` times sufficient force
+    `min(exp((|F| - F_thres) / sigma_frc), 1)`, over the end effectors whose contact is intended in this
+    frame; zero where none is.
+
+    Args:
+        eef_pos_w, target_pos_w: end effectors and their contact points, m. [..., E, 3]
+        force: contact force between each end effector and the object, N. [..., E, 3]
+        active: whether contact is intended. bool [..., E]
+        tolerance: distance that costs nothing, m.
+        reduce: `mean` over the active effectors, or the best of them (`max`).
+
+    Returns:
+        Reward in [0, 1]. [..., 1]
+    """
+    distance = ((eef_pos_w - target_pos_w).norm(dim=-1) - tolerance).clamp(min=0)  # [..., E]
+    proximity = torch.exp(-distance / sigma_pos)
+    firmness = torch.exp((force.norm(dim=-1) - force_threshold).clamp(max=0) / sigma_frc)
+    intended = active.to(proximity.dtype)
+    reward = proximity * firmness * intended
+    if reduce == "max":
+        return reward.amax(-1, keepdim=True)
+    return reward.sum(-1, keepdim=True) / intended.sum(-1, keepdim=True).clamp(min=1)
+
+
+def action_rate(action: Tensor, previous: Tensor) -> Tensor:
+    """Squared change of the action between control steps. [..., A], [..., A] -> [..., 1]"""
+    return (action - previous).square().sum(-1, keepdim=True)
+
+
+def limit_excess(value: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """L1 distance outside of [low, high], summed over joints. [..., J] -> [..., 1]"""
+    return ((low - value).clamp(min=0) + (value - high).clamp(min=0)).sum(-1, keepdim=True)
+
+
+def feet_impact(force: Tensor, previous_force: Tensor, *, weight_force: float) -> Tensor:
+    """Squared rise of each foot's force in one control step, in units of `weight_force` N, over both feet.
+
+    Standing and pushing off cost nothing; landing hard does.
+
+    Args:
+        force, previous_force: on each foot, N. [..., 2, 3]
+        weight_force: the robot's weight, N.
+
+    Returns:
+        [..., 1]
+    """
+    rise = (force.norm(dim=-1) - previous_force.norm(dim=-1)).clamp(min=0) / weight_force
+    return rise.square().sum(-1, keepdim=True)
+
+
+def feet_slip(foot_lin_vel_w: Tensor, force: Tensor, *, force_threshold: float) -> Tensor:
+    """Horizontal speed of the feet that carry load, m/s summed over feet. [..., 2, 3], [..., 2, 3] -> [..., 1]"""
+    loaded = force.norm(dim=-1) > force_threshold
+    return (foot_lin_vel_w[..., :2].norm(dim=-1) * loaded).sum(-1, keepdim=True)
+
+
+def feet_air_time(air_time: Tensor, touchdown: Tensor, *, threshold: float) -> Tensor:
+    """Shortfall of each swing below `threshold` seconds, charged at touchdown: many little steps cost, none do not.
+
+    Args:
+        air_time: of the swing that ends, s. [..., 2]
+        touchdown: bool [..., 2]
+
+    Returns:
+        s. [..., 1]
+    """
+    return ((threshold - air_time).clamp(min=0) * touchdown).sum(-1, keepdim=True)
+

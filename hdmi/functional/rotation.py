@@ -1,0 +1,95 @@
+"""Rotations as unit quaternions wxyz, broadcasting over leading dimensions."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def quat_conjugate(q: Tensor) -> Tensor:
+    """Inverse of a unit quaternion. [..., 4] -> [..., 4]"""
+    return torch.cat([q[..., :1], -q[..., 1:]], dim=-1)
+
+
+def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product: the rotation b followed by a. [..., 4], [..., 4] -> [..., 4]"""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        dim=-1,
+    )
+
+
+def quat_apply(q: Tensor, v: Tensor) -> Tensor:
+    """Rotates vectors. [..., 4], [..., 3] -> [..., 3]"""
+    xyz = q[..., 1:]
+    t = 2 * torch.linalg.cross(*torch.broadcast_tensors(xyz, v))
+    return v + q[..., :1] * t + torch.linalg.cross(*torch.broadcast_tensors(xyz, t))
+
+
+def quat_apply_inverse(q: Tensor, v: Tensor) -> Tensor:
+    """Rotates vectors by the inverse: world to body frame. [..., 4], [..., 3] -> [..., 3]"""
+    return quat_apply(quat_conjugate(q), v)
+
+
+def quat_angle(a: Tensor, b: Tensor) -> Tensor:
+    """Angle of the rotation between two orientations, rad in [0, pi]. [..., 4], [..., 4] -> [...]
+
+    Only the vector part of the relative rotation is needed: |w| follows from the dot product.
+    """
+    w = (a * b).sum(-1).abs()
+    # |vec|^2 = |a|^2 |b|^2 - (a . b)^2; atan2 keeps small angles accurate where acos would not
+    aw, bw = a[..., :1], b[..., :1]
+    vec = aw * b[..., 1:] - bw * a[..., 1:] - torch.linalg.cross(*torch.broadcast_tensors(a[..., 1:], b[..., 1:]))
+    return 2 * torch.atan2(vec.norm(dim=-1), w)
+
+
+def yaw_quat(q: Tensor) -> Tensor:
+    """Heading of an orientation: the rotation about world z of its x axis. [..., 4] -> [..., 4]"""
+    w, x, y, z = q.unbind(-1)
+    half = 0.5 * torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    zero = torch.zeros_like(half)
+    return torch.stack([half.cos(), zero, zero, half.sin()], dim=-1)
+
+
+def quat_from_axis_angle(axis: Tensor, angle: Tensor) -> Tensor:
+    """Rotation by `angle` rad about unit `axis`. [..., 3], [...] -> [..., 4]"""
+    half = 0.5 * angle[..., None]
+    return torch.cat([half.cos(), half.sin() * axis], dim=-1)
+
+
+def quat_from_euler(rpy: Tensor) -> Tensor:
+    """Rotation with roll, pitch, yaw (x, then y, then z, about fixed axes), rad. [..., 3] -> [..., 4]"""
+    cr, cp, cy = (0.5 * rpy).cos().unbind(-1)
+    sr, sp, sy = (0.5 * rpy).sin().unbind(-1)
+    return torch.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ],
+        dim=-1,
+    )
+
+
+def quat_to_rot6d(q: Tensor) -> Tensor:
+    """First two columns of the rotation matrix, a continuous representation for networks. [..., 4] -> [..., 6]"""
+    w, x, y, z = q.unbind(-1)
+    return torch.stack(
+        [
+            1 - 2 * (y * y + z * z),
+            2 * (x * y + w * z),
+            2 * (x * z - w * y),
+            2 * (x * y - w * z),
+            1 - 2 * (x * x + z * z),
+            2 * (y * z + w * x),
+        ],
+        dim=-1,
+    )

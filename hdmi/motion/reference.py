@@ -1,0 +1,218 @@
+"""The reference that training tracks: a motion in the order of the robot table, at the control rate, as tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation, Slerp
+from torch import Tensor
+
+from hdmi.assets import Effector, ObjectConfig, SceneryConfig, default_joint_pos, g1
+from hdmi.motion.kinematics import angular_velocity, derivative, forward_kinematics
+from hdmi.motion.motion import Motion, MotionError, load_motion
+
+_EMBEDDED = Path(__file__).parent / "references"
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A robot-and-object reference s_t = (robot, object, c_t) with contact points (section III-A).
+
+    Float32 tensors, world frame, T frames at the control rate; E is 0 and the object fields are empty for a
+    robot-only motion, K is 0 for a rigid object.
+    """
+
+    name: str
+    joint_pos: Tensor  # [T, 29] rad
+    joint_vel: Tensor  # [T, 29]
+    body_pos: Tensor  # [T, B, 3]
+    body_quat: Tensor  # [T, B, 4]
+    body_lin_vel: Tensor  # [T, B, 3]
+    body_ang_vel: Tensor  # [T, B, 3]
+    object_pos: Tensor  # [T, 3] or [T, 0]
+    object_quat: Tensor  # [T, 4] or [T, 0]
+    object_lin_vel: Tensor
+    object_ang_vel: Tensor
+    object_joint_pos: Tensor  # [T, K]
+    object_joint_vel: Tensor  # [T, K]
+    contact: Tensor  # bool [T, E]
+    contact_point: Tensor  # [T, E, 3] in the frame of the object's link
+    placements: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]  # object and scenery at the first frame
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.joint_pos)
+
+    @property
+    def has_object(self) -> bool:
+        return self.object_pos.shape[-1] == 3
+
+    def to(self, device: torch.device | str) -> Reference:
+        """The same reference on another device."""
+        moved = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{k: v.to(device) for k, v in moved.items() if isinstance(v, Tensor)})
+
+
+def find_motion(name: str, motion_root: str | None = None) -> Path:
+    """Folder of a motion: under `motion_root` if given, else among those that ship with the package.
+
+    Raises:
+        MotionError: if there is none; says where was looked and what is there.
+    """
+    root = Path(motion_root).expanduser() if motion_root else _EMBEDDED
+    if (root / name / "meta.json").is_file():
+        return root / name
+    there = sorted(p.parent.name for p in root.glob("*/meta.json")) if root.is_dir() else []
+    raise MotionError(
+        f"motion {name!r}: not under {root} (there: {', '.join(there) or 'no motions'}); "
+        "set motion_root=FOLDER to the folder that holds it"
+    )
+
+
+def make_reference(
+    motion: Motion | str | Path,
+    *,
+    control_dt: float,
+    object: ObjectConfig | None = None,
+    scenery: Sequence[SceneryConfig] = (),
+    effectors: Sequence[Effector] = (),
+) -> Reference:
+    """Completes a motion to a reference: table order, control rate, all joints and bodies.
+
+    Joints that the motion lacks hold the default pose; bodies that it lacks come from forward kinematics. The
+    object's name and hinge, the scenery and the effectors are the task's.
+
+    Raises:
+        MotionError: if the motion has joints or bodies that nothing knows, lacks the pelvis, the object, its
+            hinge, or contact labels for the effectors.
+    """
+    motion = motion if isinstance(motion, Motion) else load_motion(motion)
+    where = f"motion {motion.name!r}"
+    if "pelvis" not in motion.body_names:
+        raise MotionError(f"{where}: body_names lacks the root 'pelvis'")
+    hinge = object.hinge.name if object is not None and object.hinge is not None else None
+    unknown = [name for name in motion.joint_names if name not in g1.JOINT_NAMES and name != hinge]
+    if unknown:
+        raise MotionError(f"{where}: joint_names: {unknown} are neither the robot's nor the object's hinge ({hinge!r})")
+    if not any(name in g1.JOINT_NAMES for name in motion.joint_names):
+        raise MotionError(f"{where}: joint_names has no joint of the robot")
+    motion = resample(motion, 1.0 / control_dt)
+    fps, num_frames = motion.fps, motion.num_frames
+
+    joint_pos = np.tile(default_joint_pos(), (num_frames, 1))
+    joint_vel = np.zeros_like(joint_pos)
+    for i, name in enumerate(motion.joint_names):
+        if name in g1.JOINT_NAMES:
+            j = g1.JOINT_NAMES.index(name)
+            joint_pos[:, j], joint_vel[:, j] = motion.joint_pos[:, i], motion.joint_vel[:, i]
+
+    root = motion.body_names.index("pelvis")
+    body_pos, body_quat = forward_kinematics(motion.body_pos_w[:, root], motion.body_quat_w[:, root], joint_pos)
+    body_lin_vel, body_ang_vel = derivative(body_pos, fps), angular_velocity(body_quat, fps)
+    for b, name in enumerate(g1.BODY_NAMES):
+        if name in motion.body_names:
+            i = motion.body_names.index(name)
+            body_pos[:, b], body_quat[:, b] = motion.body_pos_w[:, i], motion.body_quat_w[:, i]
+            body_lin_vel[:, b], body_ang_vel[:, b] = motion.body_lin_vel_w[:, i], motion.body_ang_vel_w[:, i]
+
+    empty = np.zeros((num_frames, 0))
+    object_state = [empty] * 4
+    hinge_pos = hinge_vel = empty
+    if object is not None:
+        if object.name not in motion.body_names:
+            raise MotionError(f"{where}: body_names lacks the task's object {object.name!r}")
+        i = motion.body_names.index(object.name)
+        object_state = [
+            getattr(motion, key)[:, i] for key in ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w")
+        ]
+        if hinge is not None:
+            if hinge not in motion.joint_names:
+                raise MotionError(f"{where}: joint_names lacks the object's hinge {hinge!r}")
+            i = motion.joint_names.index(hinge)
+            hinge_pos, hinge_vel = motion.joint_pos[:, i : i + 1], motion.joint_vel[:, i : i + 1]
+    contact, points = _contacts(motion, effectors)
+
+    placed = [item.name for item in scenery] + ([object.name] if object is not None else [])
+    placements = {}
+    for name in placed:
+        if name in motion.body_names:
+            i = motion.body_names.index(name)
+            placements[name] = (tuple(motion.body_pos_w[0, i].tolist()), tuple(motion.body_quat_w[0, i].tolist()))
+
+    def tensor(array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).float()
+
+    return Reference(
+        name=motion.name,
+        joint_pos=tensor(joint_pos),
+        joint_vel=tensor(joint_vel),
+        body_pos=tensor(body_pos),
+        body_quat=tensor(body_quat),
+        body_lin_vel=tensor(body_lin_vel),
+        body_ang_vel=tensor(body_ang_vel),
+        object_pos=tensor(object_state[0]),
+        object_quat=tensor(object_state[1]),
+        object_lin_vel=tensor(object_state[2]),
+        object_ang_vel=tensor(object_state[3]),
+        object_joint_pos=tensor(hinge_pos),
+        object_joint_vel=tensor(hinge_vel),
+        contact=torch.from_numpy(contact.copy()),
+        contact_point=tensor(points),
+        placements=placements,
+    )
+
+
+def _contacts(motion: Motion, effectors: Sequence[Effector]) -> tuple[np.ndarray, np.ndarray]:
+    count = len(effectors)
+    if count == 0:
+        return np.zeros((motion.num_frames, 0), bool), np.zeros((motion.num_frames, 0, 3))
+    if motion.object_contact is None:
+        raise MotionError(f"motion {motion.name!r}: has no object_contact labels, and the task has {count} effectors")
+    columns = motion.object_contact.shape[1]
+    if columns not in (1, count):
+        raise MotionError(f"motion {motion.name!r}: object_contact has {columns} columns; the task has {count} effectors")
+    contact = np.broadcast_to(motion.object_contact, (motion.num_frames, count))
+    points = np.asarray([effector.target for effector in effectors], dtype=float)
+    points = np.broadcast_to(points, (motion.num_frames, count, 3))
+    if motion.contact_points is not None:
+        if motion.contact_points.shape[1] != count:
+            raise MotionError(
+                f"motion {motion.name!r}: contact_points has {motion.contact_points.shape[1]} effectors, the task {count}"
+            )
+        points = motion.contact_points
+    return contact, points
+
+
+def resample(motion: Motion, fps: float) -> Motion:
+    """The motion at another rate: positions and velocities linear, orientations slerp, labels nearest."""
+    if abs(motion.fps - fps) < 1e-6:
+        return motion
+    old = np.arange(motion.num_frames) / motion.fps
+    new = np.arange(int(np.floor(old[-1] * fps + 1e-6)) + 1) / fps
+    new = np.minimum(new, old[-1])
+
+    def linear(array: np.ndarray) -> np.ndarray:
+        flat = array.reshape(len(array), -1)
+        out = np.stack([np.interp(new, old, column) for column in flat.T], axis=-1)
+        return out.reshape(len(new), *array.shape[1:]).astype(np.float32)
+
+    quat = np.stack(
+        [
+            Slerp(old, Rotation.from_quat(motion.body_quat_w[:, b], scalar_first=True))(new).as_quat(scalar_first=True)
+            for b in range(len(motion.body_names))
+        ],
+        axis=1,
+    ).astype(np.float32)
+    nearest = np.abs(new[:, None] - old[None]).argmin(1)
+    return replace(
+        motion,
+        fps=fps,
+        body_quat_w=quat,
+        object_contact=None if motion.object_contact is None else motion.object_contact[nearest],
+        contact_points=None if motion.contact_points is None else linear(motion.contact_points),
+        **{k: linear(getattr(motion, k)) for k in ("body_pos_w", "body_lin_vel_w", "body_ang_vel_w", "joint_pos", "joint_vel")},
+    )
