@@ -1,5 +1,6 @@
 """Robot and object models, built with MjSpec from plain tables of figures."""
 
+from hdmi.assets import g1
 from hdmi.assets.objects import GeomConfig, HingeConfig, ObjectConfig, SceneryConfig
 from hdmi.assets.robot import RobotConfig, default_joint_pos, match_names, per_joint
 from hdmi.assets.scene import Effector, Scene, SimConfig, build_scene
@@ -15,6 +16,7 @@ __all__ = [
     "SimConfig",
     "build_scene",
     "default_joint_pos",
+    "g1",
     "match_names",
     "per_joint",
 ]

@@ -235,4 +235,3 @@ def _add_meshes(spec: mujoco.MjSpec, bodies: dict[str, mujoco.MjsBody], folder: 
             type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, group=VISUAL_GROUP, contype=0, conaffinity=0, mass=0.0,
             rgba=_LIGHT,
         )  # fmt: skip
-

@@ -200,9 +200,7 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
     )  # fmt: skip
 
 
-def _add_contact_sensors(
-    spec: mujoco.MjSpec, object: ObjectConfig | None, effectors: Sequence[Effector]
-) -> None:
+def _add_contact_sensors(spec: mujoco.MjSpec, object: ObjectConfig | None, effectors: Sequence[Effector]) -> None:
     force = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
     common = {"type": mujoco.mjtSensor.mjSENS_CONTACT, "intprm": [force, _NETFORCE, 1]}
     for foot in g1.FEET:

@@ -131,4 +131,3 @@ class BatchBackend:
 
 def _ids(mask: Tensor) -> np.ndarray:
     return mask.reshape(-1).nonzero().squeeze(-1).numpy()
-

@@ -29,10 +29,12 @@ class HumanoidObjectEnv(EnvBase):
 
     Action:
         `action`: joint position targets, rad. [N, 29], held for the control step; or [N, S, 29], one after
-        another for decimation / S physics steps each.
+        another for decimation / S physics steps each. Optionally `push` [N, 6]: linear (m/s) and angular (rad/s)
+        world velocity to add to the root first.
 
     Writes (float32, world frame, quaternions wxyz; B = 30 bodies, K object joints, E effectors):
         `robot/{joint_pos, joint_vel, joint_torque, joint_target}` [N, 29];
+        `robot/{root_pos, root_lin_vel, root_ang_vel}` [N, 3]; `robot/root_quat` [N, 4];
         `robot/{body_pos, body_lin_vel, body_ang_vel}` [N, B, 3]; `robot/body_quat` [N, B, 4];
         `robot/foot_force` [N, 2, 3], N;
         with an object: `object/{pos, lin_vel, ang_vel, link_pos}` [N, 3], `object/{quat, link_quat}` [N, 4] (the
@@ -92,7 +94,8 @@ class HumanoidObjectEnv(EnvBase):
 
         robot = {key: unbounded(joints) for key in ("joint_pos", "joint_vel", "joint_torque", "joint_target")}
         robot |= {key: unbounded(bodies, 3) for key in ("body_pos", "body_lin_vel", "body_ang_vel")}
-        robot |= {"body_quat": unbounded(bodies, 4), "foot_force": unbounded(2, 3)}
+        robot |= {key: unbounded(3) for key in ("root_pos", "root_lin_vel", "root_ang_vel")}
+        robot |= {"body_quat": unbounded(bodies, 4), "root_quat": unbounded(4), "foot_force": unbounded(2, 3)}
         spec: dict[str, object] = {"robot": Composite(robot, shape=(n,))}
         if scene.object_body is not None:
             k = scene.num_object_joints
@@ -126,6 +129,9 @@ class HumanoidObjectEnv(EnvBase):
         decimation, count = self.scene.sim.decimation, targets.shape[-2]
         if decimation % count:
             raise ValueError(f"action: {count} targets per control step do not divide the decimation {decimation}")
+        push = tensordict.get("push", None)
+        if push is not None:
+            self._push(push)
         ctrl = self.backend.data("ctrl")
         for s in range(count):
             ctrl.copy_(targets[:, s])
@@ -142,6 +148,16 @@ class HumanoidObjectEnv(EnvBase):
         out.set("truncated", torch.zeros_like(terminated))
         out.set("done", terminated.clone())
         return out
+
+    def _push(self, velocity: Tensor) -> None:
+        """Adds linear and angular world velocities to the root. [N, 6]"""
+        mask = (velocity != 0).any(-1)
+        if not mask.any():
+            return
+        qvel, quat = self.backend.data("qvel"), self._read("qpos")[mask, 3:7]
+        qvel[mask, :3] += velocity[mask, :3].double()
+        qvel[mask, 3:6] += quat_apply_inverse(quat, velocity[mask, 3:]).double()
+        self.backend.refresh(mask)
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -162,9 +178,7 @@ class HumanoidObjectEnv(EnvBase):
 
     def get_state(self) -> TensorDict:
         """Everything that determines the future of all worlds: state and randomized model fields."""
-        return TensorDict(
-            {"backend": TensorDict(self.backend.get_state()), "object_scale": self._object_scale.clone()}
-        )
+        return TensorDict({"backend": TensorDict(self.backend.get_state()), "object_scale": self._object_scale.clone()})
 
     def set_state(self, state: TensorDictBase) -> None:
         """Restores what `get_state` returned."""
@@ -250,6 +264,7 @@ class HumanoidObjectEnv(EnvBase):
             "body_ang_vel": ang_vel[:, self._body],
             "foot_force": sensors[:, torch.from_numpy(scene.foot_sensors)],
         }
+        robot |= {f"root_{key}": robot[f"body_{key}"][:, 0] for key in ("pos", "quat", "lin_vel", "ang_vel")}
         n, bs = self.num_envs, self.batch_size
         state = {"robot": TensorDict(robot, batch_size=bs, device=self.device)}
         if scene.object_body is not None:

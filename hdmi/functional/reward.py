@@ -103,4 +103,3 @@ def feet_air_time(air_time: Tensor, touchdown: Tensor, *, threshold: float) -> T
         s. [..., 1]
     """
     return ((threshold - air_time).clamp(min=0) * touchdown).sum(-1, keepdim=True)
-

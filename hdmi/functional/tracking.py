@@ -8,7 +8,9 @@ from torch import Tensor
 from hdmi.functional.rotation import quat_apply_inverse, quat_conjugate, quat_multiply, yaw_quat
 
 
-def local_pose(body_pos_w: Tensor, body_quat_w: Tensor, root_pos_w: Tensor, root_quat_w: Tensor) -> tuple[Tensor, Tensor]:
+def local_pose(
+    body_pos_w: Tensor, body_quat_w: Tensor, root_pos_w: Tensor, root_quat_w: Tensor
+) -> tuple[Tensor, Tensor]:
     """Body poses in the root's yaw frame at the root's ground projection (height is kept).
 
     Args:

@@ -55,8 +55,9 @@ def angular_velocity(quat: np.ndarray, fps: float) -> np.ndarray:
     steps = np.full(len(quat), 2.0)
     steps[[0, -1]] = 1.0
     flat = (-1, 4)
-    relative = Rotation.from_quat(after.reshape(flat), scalar_first=True) * Rotation.from_quat(
-        before.reshape(flat), scalar_first=True
-    ).inv()
+    relative = (
+        Rotation.from_quat(after.reshape(flat), scalar_first=True)
+        * Rotation.from_quat(before.reshape(flat), scalar_first=True).inv()
+    )
     velocity = relative.as_rotvec().reshape(*quat.shape[:-1], 3) * fps
     return velocity / steps.reshape(-1, *([1] * (quat.ndim - 1)))

@@ -111,7 +111,9 @@ def load_motion(path: str | Path) -> Motion:
         raw = raw[:, None] if raw.ndim == 1 else raw
         raw = _checked(npz_path, "object_contact", raw, (num_frames, raw.shape[-1]))
         if (bad := np.argwhere((raw != 0) & (raw != 1))).size:
-            raise MotionError(f"{npz_path}: object_contact: {raw[tuple(bad[0])]} at frame {bad[0][0]} is neither 0 nor 1")
+            raise MotionError(
+                f"{npz_path}: object_contact: {raw[tuple(bad[0])]} at frame {bad[0][0]} is neither 0 nor 1"
+            )
         contact = raw.astype(bool)
     if "contact_points" in arrays:
         raw = arrays["contact_points"]

@@ -174,7 +174,9 @@ def _contacts(motion: Motion, effectors: Sequence[Effector]) -> tuple[np.ndarray
         raise MotionError(f"motion {motion.name!r}: has no object_contact labels, and the task has {count} effectors")
     columns = motion.object_contact.shape[1]
     if columns not in (1, count):
-        raise MotionError(f"motion {motion.name!r}: object_contact has {columns} columns; the task has {count} effectors")
+        raise MotionError(
+            f"motion {motion.name!r}: object_contact has {columns} columns; the task has {count} effectors"
+        )
     contact = np.broadcast_to(motion.object_contact, (motion.num_frames, count))
     points = np.asarray([effector.target for effector in effectors], dtype=float)
     points = np.broadcast_to(points, (motion.num_frames, count, 3))
@@ -214,5 +216,8 @@ def resample(motion: Motion, fps: float) -> Motion:
         body_quat_w=quat,
         object_contact=None if motion.object_contact is None else motion.object_contact[nearest],
         contact_points=None if motion.contact_points is None else linear(motion.contact_points),
-        **{k: linear(getattr(motion, k)) for k in ("body_pos_w", "body_lin_vel_w", "body_ang_vel_w", "joint_pos", "joint_vel")},
+        **{
+            k: linear(getattr(motion, k))
+            for k in ("body_pos_w", "body_lin_vel_w", "body_ang_vel_w", "joint_pos", "joint_vel")
+        },
     )

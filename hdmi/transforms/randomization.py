@@ -1,0 +1,253 @@
+"""Domain randomization: model fields drawn per episode or once per world, joint offsets and pushes.
+
+Model terms write full per-world rows under `init/model/<MjModel field>` of the reset tensordict, on top of what terms
+before them wrote; `HumanoidObjectEnv` applies the rows of the worlds that reset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import mujoco
+import numpy as np
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import Transform
+
+from hdmi.assets import g1, match_names
+from hdmi.transforms.action import _ActionStateTransform
+
+
+def _between(low: float, high: float, shape: Sequence[int], device: torch.device | None) -> Tensor:
+    return low + (high - low) * torch.rand(tuple(shape), device=device)
+
+
+class ModelRandomization(Transform):
+    """Base of terms that draw model fields.
+
+    Args:
+        per: `episode` draws at every reset; `world` once, at the first reset, so that worlds differ but stay.
+    """
+
+    def __init__(self, per: Literal["episode", "world"] = "episode"):
+        super().__init__()
+        if per not in ("episode", "world"):
+            raise ValueError(f"{type(self).__name__}: per is 'episode' or 'world', got {per!r}")
+        self.per = per
+        self._drawn = False
+
+    def draw(self, init: TensorDictBase) -> None:
+        """Writes into `init` (batch [N]) what this term randomizes."""
+        raise NotImplementedError
+
+    def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
+        if tensordict is None:
+            tensordict = TensorDict({}, batch_size=self.parent.batch_size, device=self.parent.device)
+        if self.per == "world" and self._drawn:
+            return tensordict
+        self._drawn = True
+        init = tensordict.get("init", None)
+        if init is None:
+            init = TensorDict({}, batch_size=tensordict.batch_size, device=tensordict.device)
+        self.draw(init)
+        tensordict.set("init", init)
+        return tensordict
+
+
+def _rows(init: TensorDictBase, model: mujoco.MjModel, field: str) -> Tensor:
+    """A copy of the per-world rows that terms before wrote, or of the model's. [N, ...]"""
+    rows = init.get(("model", field), None)
+    if rows is not None:
+        return rows.clone()
+    base = torch.from_numpy(np.array(getattr(model, field), dtype=np.float32))
+    return base.expand(*init.batch_size, *base.shape).clone()
+
+
+class MassRandomization(ModelRandomization):
+    """Scales mass and inertia of bodies, each on its own, or sets the total mass of an object.
+
+    Args:
+        bodies: name patterns among the model's bodies.
+        scale: range of the factor; or
+        mass: range of the bodies' total mass, kg, shared in proportion.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        bodies: Sequence[str],
+        scale: Sequence[float] | None = None,
+        mass: Sequence[float] | None = None,
+        per: Literal["episode", "world"] = "episode",
+    ):
+        super().__init__(per)
+        if (scale is None) == (mass is None):
+            raise ValueError("MassRandomization: give either scale or mass")
+        names = [model.body(i).name for i in range(model.nbody)]
+        self.bodies = match_names(bodies, names, "MassRandomization.bodies")
+        self.model, self.scale, self.mass = model, scale, mass
+        self.total = float(model.body_mass[self.bodies].sum())
+
+    def draw(self, init: TensorDictBase) -> None:
+        n = init.batch_size[0]
+        if self.mass is not None:
+            factor = (_between(*self.mass, (n, 1), init.device) / self.total).expand(n, len(self.bodies))
+        else:
+            assert self.scale is not None
+            factor = _between(*self.scale, (n, len(self.bodies)), init.device)
+        for field, shaped in (("body_mass", factor), ("body_inertia", factor.unsqueeze(-1))):
+            rows = _rows(init, self.model, field)
+            rows[:, self.bodies] *= shaped
+            init.set(("model", field), rows)
+
+
+class CenterOfMassRandomization(ModelRandomization):
+    """Shifts the centre of mass of bodies by up to `shift` m along each axis."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        bodies: Sequence[str],
+        shift: float,
+        per: Literal["episode", "world"] = "episode",
+    ):
+        super().__init__(per)
+        names = [model.body(i).name for i in range(model.nbody)]
+        self.bodies = match_names(bodies, names, "CenterOfMassRandomization.bodies")
+        self.model, self.shift = model, shift
+
+    def draw(self, init: TensorDictBase) -> None:
+        rows = _rows(init, self.model, "body_ipos")
+        shape = (init.batch_size[0], len(self.bodies), 3)
+        rows[:, self.bodies] += _between(-self.shift, self.shift, shape, init.device)
+        init.set(("model", "body_ipos"), rows)
+
+
+class FrictionRandomization(ModelRandomization):
+    """Draws one sliding friction for all geoms of the named bodies.
+
+    MuJoCo uses the larger friction of two geoms in contact.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        bodies: Sequence[str],
+        friction: Sequence[float],
+        per: Literal["episode", "world"] = "episode",
+    ):
+        super().__init__(per)
+        names = [model.body(i).name for i in range(model.nbody)]
+        wanted = match_names(bodies, names, "FrictionRandomization.bodies")
+        self.geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in wanted]
+        self.model, self.friction = model, friction
+
+    def draw(self, init: TensorDictBase) -> None:
+        rows = _rows(init, self.model, "geom_friction")
+        rows[:, self.geoms, 0] = _between(*self.friction, (init.batch_size[0], 1), init.device)
+        init.set(("model", "geom_friction"), rows)
+
+
+class ObjectScale(ModelRandomization):
+    """Scales the object's geoms about its body's origin; contact points scale with it. Writes `init/object_scale`."""
+
+    def __init__(self, scale: Sequence[float], per: Literal["episode", "world"] = "episode"):
+        super().__init__(per)
+        self.range = scale
+
+    def draw(self, init: TensorDictBase) -> None:
+        init.set("object_scale", _between(*self.range, (init.batch_size[0], 1), init.device))
+
+
+class ObjectJointRandomization(ModelRandomization):
+    """Draws dry friction (N m) and damping (N m s/rad) of the object's joint."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        joint: str,
+        friction: Sequence[float],
+        damping: Sequence[float],
+        per: Literal["episode", "world"] = "episode",
+    ):
+        super().__init__(per)
+        names = [model.joint(i).name for i in range(model.njnt)]
+        self.dof = int(model.jnt_dofadr[match_names([joint], names, "ObjectJointRandomization.joint")[0]])
+        self.model, self.ranges = model, {"dof_frictionloss": friction, "dof_damping": damping}
+
+    def draw(self, init: TensorDictBase) -> None:
+        for field, span in self.ranges.items():
+            rows = _rows(init, self.model, field)
+            rows[:, self.dof] = _between(*span, (init.batch_size[0],), init.device)
+            init.set(("model", field), rows)
+
+
+class JointOffset(_ActionStateTransform):
+    """Calibration error of the joints: a constant offset on every target, drawn per episode.
+
+    State: `joint_offset` [N, J], rad.
+
+    Args:
+        offset: half range, rad.
+    """
+
+    def __init__(self, offset: float, size: int = len(g1.JOINT_NAMES), action_key: NestedKey = "action"):
+        super().__init__(action_key)
+        self.offset, self.size = offset, size
+
+    def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
+        return {"joint_offset": _between(-self.offset, self.offset, (*batch_size, self.size), device)}
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict.get(self.action_key, None)
+        if action is not None:
+            offset = tensordict.get("joint_offset")
+            # targets may come one per physics step [N, S, J]
+            tensordict.set(self.action_key, action + (offset if action.ndim == 2 else offset.unsqueeze(-2)))
+        return tensordict
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        next_tensordict.set("joint_offset", tensordict.get("joint_offset"))
+        return next_tensordict
+
+
+class RandomPush(_ActionStateTransform):
+    """Pushes the robot: now and then adds a random velocity to its root.
+
+    Writes `push` [N, 6] into the stepped tensordict, which `HumanoidObjectEnv` adds to the root's linear and
+    angular world velocity before stepping. State: `push_countdown` int64 [N, 1].
+
+    Args:
+        interval: range of control steps between pushes.
+        linear, angular: half ranges of the added velocity, m/s and rad/s.
+    """
+
+    def __init__(self, interval: Sequence[int], linear: Sequence[float], angular: Sequence[float]):
+        super().__init__()
+        self.low, self.high = (int(i) for i in interval)
+        if not 1 <= self.low <= self.high:
+            raise ValueError(f"push.interval: expected 1 <= low <= high, got {list(interval)}")
+        half_range = torch.tensor([*linear, *angular], dtype=torch.float32)
+        self.register_buffer("half_range", half_range, persistent=False)
+
+    def _countdown(self, batch_size: torch.Size, device: torch.device | None) -> Tensor:
+        return torch.randint(self.low, self.high + 1, (*batch_size, 1), device=device)
+
+    def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
+        return {"push_countdown": self._countdown(batch_size, device)}
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        countdown = tensordict.get("push_countdown", None)
+        if countdown is not None:
+            size = (*countdown.shape[:-1], len(self.half_range))
+            velocity = (2 * torch.rand(size, device=countdown.device) - 1) * self.half_range
+            tensordict.set("push", velocity * (countdown <= 1))
+        return tensordict
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        countdown = tensordict.get("push_countdown")
+        fresh = self._countdown(countdown.shape[:-1], countdown.device)
+        next_tensordict.set("push_countdown", torch.where(countdown <= 1, fresh, countdown - 1))
+        return next_tensordict

@@ -1,0 +1,293 @@
+"""The reference motion as transforms: its clock, its frames, and starting episodes from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite
+from torchrl.envs import Transform
+
+from hdmi.assets import g1, match_names
+from hdmi.functional import local_pose, quat_from_euler, quat_multiply
+from hdmi.motion import Reference
+from hdmi.transforms.common import StateTransform, set_terminated, spec_like
+
+FRAME_KEY: NestedKey = ("init", "frame")
+
+
+def _uniform(shape: Sequence[int], half_range: Tensor | float, device: torch.device | None) -> Tensor:
+    return (2 * torch.rand(shape, device=device) - 1) * half_range
+
+
+class MotionReference(StateTransform):
+    """Advances the motion clock and writes the reference of the present and of future frames.
+
+    The reference of a step is the one that its state is compared with: after a reset to frame f it is frame f, and
+    each step moves on by one. Past the end the last frame stays.
+
+    Reads on reset `init/frame` int64 [N, 1] if something wrote it (else frame 0).
+    Writes under `ref` (N worlds, K tracked bodies, J tracked joints, E effectors, F future steps):
+        `step` int64 [N, 1]; `phase` [N, 1] in [0, 1]; `joint_pos`, `joint_vel` [N, 29];
+        `root_pos` [N, 3], `root_quat` [N, 4]; `body_pos`, `body_lin_vel`, `body_ang_vel` [N, K, 3],
+        `body_quat` [N, K, 4]; `body_pos_local`, `body_quat_local` (see `functional.local_pose`);
+        `future/joint_pos` [N, F, J], `future/body_pos_local` [N, F, K, 3] (future bodies in the present reference
+        root's yaw frame); with an object `object_pos`, `object_quat`, `object_joint_pos`; with effectors
+        `contact` bool [N, E], `contact_point` [N, E, 3] in the frame of the object's link.
+
+    Args:
+        reference: what to track.
+        tracked_bodies, tracked_joints: name patterns.
+        future_steps: control steps ahead.
+    """
+
+    def __init__(
+        self,
+        reference: Reference,
+        tracked_bodies: Sequence[str],
+        tracked_joints: Sequence[str],
+        future_steps: Sequence[int] = (1, 2, 8, 16, 32),
+    ):
+        joints = match_names(tracked_joints, g1.JOINT_NAMES, "tracked_joints")
+        bodies = match_names(tracked_bodies, g1.BODY_NAMES, "tracked_bodies")
+        table = _reference_table(reference, bodies, joints, future_steps)
+        super().__init__(in_keys=[], out_keys=[("ref", "step"), *table])
+        self.num_frames = reference.num_frames
+        self._shapes = {key: value.shape[1:] for key, value in table.items()}
+        self._dtypes = {key: value.dtype for key, value in table.items()}
+        # one gather per step instead of one per key
+        flat = torch.cat([value.reshape(reference.num_frames, -1).float() for value in table.values()], dim=-1)
+        self.register_buffer("table", flat, persistent=False)
+
+    def _lookup(self, step: Tensor) -> dict[NestedKey, Tensor]:
+        rows = self.table[step.reshape(-1)].reshape(*step.shape[:-1], -1)
+        sizes = [shape.numel() for shape in self._shapes.values()]
+        out: dict[NestedKey, Tensor] = {("ref", "step"): step}
+        for (key, shape), value in zip(self._shapes.items(), rows.split(sizes, dim=-1), strict=True):
+            out[key] = value.unflatten(-1, shape).to(self._dtypes[key])
+        return out
+
+    def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
+        return self._lookup(torch.zeros(*batch_size, 1, dtype=torch.int64, device=device))
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        # only the clock is read back
+        step = torch.zeros(*input_spec.shape, 1, dtype=torch.int64, device=input_spec.device)
+        input_spec = Transform.transform_input_spec(self, input_spec)
+        input_spec["full_state_spec", "ref", "step"] = spec_like(step)
+        return input_spec
+
+    def _write(self, tensordict: TensorDictBase, step: Tensor) -> TensorDictBase:
+        for key, value in self._lookup(step).items():
+            tensordict.set(key, value)
+        return tensordict
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        step = tensordict.get(FRAME_KEY, None)
+        if step is None:
+            step = torch.zeros(*tensordict_reset.batch_size, 1, dtype=torch.int64, device=tensordict_reset.device)
+        return self._write(tensordict_reset, step)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        step = (tensordict.get(("ref", "step")) + 1).clamp(max=self.num_frames - 1)
+        return self._write(next_tensordict, step)
+
+
+def _reference_table(
+    reference: Reference, bodies: Sequence[int], joints: Sequence[int], future_steps: Sequence[int]
+) -> dict[NestedKey, Tensor]:
+    r, index = reference, list(bodies)
+    root_pos, root_quat = r.body_pos[:, 0], r.body_quat[:, 0]
+    pos_local, quat_local = local_pose(r.body_pos[:, index], r.body_quat[:, index], root_pos, root_quat)
+    last = r.num_frames - 1
+    table: dict[NestedKey, Tensor] = {
+        ("ref", "phase"): torch.arange(r.num_frames)[:, None] / last,
+        ("ref", "joint_pos"): r.joint_pos,
+        ("ref", "joint_vel"): r.joint_vel,
+        ("ref", "root_pos"): root_pos,
+        ("ref", "root_quat"): root_quat,
+        ("ref", "body_pos"): r.body_pos[:, index],
+        ("ref", "body_quat"): r.body_quat[:, index],
+        ("ref", "body_lin_vel"): r.body_lin_vel[:, index],
+        ("ref", "body_ang_vel"): r.body_ang_vel[:, index],
+        ("ref", "body_pos_local"): pos_local,
+        ("ref", "body_quat_local"): quat_local,
+    }
+    if r.has_object:
+        table[("ref", "object_pos")] = r.object_pos
+        table[("ref", "object_quat")] = r.object_quat
+        if r.object_joint_pos.shape[-1]:
+            table[("ref", "object_joint_pos")] = r.object_joint_pos
+    if r.contact.shape[-1]:
+        table[("ref", "contact")] = r.contact
+        table[("ref", "contact_point")] = r.contact_point
+    if future_steps:
+        ahead = (torch.arange(r.num_frames)[:, None] + torch.as_tensor(list(future_steps))).clamp(max=last)  # [T, F]
+        table[("ref", "future", "joint_pos")] = r.joint_pos[ahead][..., list(joints)]
+        future_pos = r.body_pos[ahead][:, :, index].flatten(1, 2)  # [T, F K, 3]
+        future_local, _ = local_pose(future_pos, torch.zeros(*future_pos.shape[:-1], 4), root_pos, root_quat)
+        table[("ref", "future", "body_pos_local")] = future_local.unflatten(1, (len(future_steps), len(index)))
+    return table
+
+
+class ReferenceStateInitialization(Transform):
+    """Starts episodes from frames of the reference with small random perturbations (section III-B, (1)).
+
+    Writes on reset, before the base environment resets: `init/frame` and the state under `init` that
+    `HumanoidObjectEnv` reads. It has no effect between resets.
+
+    Args:
+        reference: where to start from.
+        start: `uniform` over all frames but the last `margin`, or `first`.
+        margin: frames at the end that no episode starts from.
+        noise: half ranges of uniform perturbations: root_pos [3] m, root_rpy [3] rad, root_lin_vel, root_ang_vel,
+            joint_pos (rad), joint_vel; object_pos [3], object_rpy [3], object_joint (rad). Absent means none.
+    """
+
+    _NOISES = (
+        "root_pos", "root_rpy", "root_lin_vel", "root_ang_vel", "joint_pos", "joint_vel",
+        "object_pos", "object_rpy", "object_joint",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        reference: Reference,
+        start: Literal["uniform", "first"] = "uniform",
+        margin: int = 1,
+        noise: Mapping[str, float | Sequence[float]] | None = None,
+    ):
+        super().__init__()
+        if start not in ("uniform", "first"):
+            raise ValueError(f"reset.start: expected 'uniform' or 'first', got {start!r}")
+        unknown = set(noise or {}) - set(self._NOISES)
+        if unknown:
+            raise ValueError(f"reset.noise: unknown {sorted(unknown)}; there is {list(self._NOISES)}")
+        self.start = start
+        self.num_starts = max(reference.num_frames - margin, 1)
+        self.reference = reference
+        for name in self._NOISES:
+            value = torch.as_tensor((noise or {}).get(name, 0.0), dtype=torch.float32)
+            self.register_buffer(f"noise_{name}", value, persistent=False)
+
+    def sample_frames(self, batch_size: torch.Size, device: torch.device | None) -> Tensor:
+        """Start frames. int64 [*batch_size]"""
+        if self.start == "first":
+            return torch.zeros(batch_size, dtype=torch.int64, device=device)
+        return torch.randint(self.num_starts, tuple(batch_size), device=device)
+
+    def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
+        if tensordict is None:
+            tensordict = TensorDict({}, batch_size=self.parent.batch_size, device=self.parent.device)
+        batch_size, device = tensordict.batch_size, tensordict.device
+        frames = self.sample_frames(batch_size, device)
+        tensordict.set(FRAME_KEY, frames.unsqueeze(-1))
+        for key, value in self.initial_state(frames).items():
+            tensordict.set(("init", key), value)
+        return tensordict
+
+    def initial_state(self, frames: Tensor) -> dict[str, Tensor]:
+        """Perturbed state of the given frames. int64 [N] -> tensors [N, ...]"""
+        ref, device = self.reference, frames.device
+
+        def noise(name: str, like: Tensor) -> Tensor:
+            return _uniform(like.shape, getattr(self, f"noise_{name}"), device)
+
+        root_pos, root_quat = ref.body_pos[frames, 0], ref.body_quat[frames, 0]
+        root_lin_vel, root_ang_vel = ref.body_lin_vel[frames, 0], ref.body_ang_vel[frames, 0]
+        joint_pos, joint_vel = ref.joint_pos[frames], ref.joint_vel[frames]
+        state = {
+            "root_pos": root_pos + noise("root_pos", root_pos),
+            "root_quat": quat_multiply(root_quat, quat_from_euler(noise("root_rpy", root_pos))),
+            "root_lin_vel": root_lin_vel + noise("root_lin_vel", root_pos),
+            "root_ang_vel": root_ang_vel + noise("root_ang_vel", root_pos),
+            "joint_pos": joint_pos + noise("joint_pos", joint_pos),
+            "joint_vel": joint_vel + noise("joint_vel", joint_vel),
+        }
+        if ref.has_object:
+            pos, quat = ref.object_pos[frames], ref.object_quat[frames]
+            state |= {
+                "object_pos": pos + noise("object_pos", pos),
+                "object_quat": quat_multiply(quat, quat_from_euler(noise("object_rpy", pos))),
+                "object_lin_vel": ref.object_lin_vel[frames],
+                "object_ang_vel": ref.object_ang_vel[frames],
+            }
+            if ref.object_joint_pos.shape[-1]:
+                joint = ref.object_joint_pos[frames]
+                state["object_joint_pos"] = joint + noise("object_joint", joint)
+                state["object_joint_vel"] = ref.object_joint_vel[frames]
+        return state
+
+
+class AdaptiveStateInitialization(ReferenceStateInitialization):
+    """Reference state initialization that starts more often shortly before frames where episodes fail.
+
+    The motion is cut into bins; each keeps an exponential average of the terminations in it, and a start's bin is
+    drawn with probability `uniform_share / bins + (1 - uniform_share) * failures`, failures normalised.
+
+    Args:
+        bins: number of bins. uniform_share: of starts that ignore failures. decay: of the average, per termination
+            batch. lead: frames before the failure's bin that the start is moved ahead.
+    """
+
+    def __init__(
+        self,
+        reference: Reference,
+        margin: int = 1,
+        noise: Mapping[str, float | Sequence[float]] | None = None,
+        bins: int = 20,
+        uniform_share: float = 0.5,
+        decay: float = 0.999,
+        lead: int = 25,
+    ):
+        super().__init__(reference, "uniform", margin, noise)
+        self.uniform_share, self.decay, self.lead = uniform_share, decay, lead
+        self.register_buffer("failures", torch.zeros(bins))
+
+    def sample_frames(self, batch_size: torch.Size, device: torch.device | None) -> Tensor:
+        bins, total = len(self.failures), self.failures.sum()
+        weights = torch.full_like(self.failures, 1 / bins)
+        if total > 0:
+            weights = self.uniform_share * weights + (1 - self.uniform_share) * self.failures / total
+        drawn = torch.multinomial(weights, batch_size.numel(), replacement=True).reshape(batch_size)
+        within = torch.rand(tuple(batch_size), device=device)
+        return ((drawn + within) / bins * self.num_starts).long().clamp(max=self.num_starts - 1)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        terminated = next_tensordict.get("terminated").squeeze(-1)
+        frames = (next_tensordict.get(("ref", "step")).squeeze(-1)[terminated] - self.lead).clamp(min=0)
+        bins = (frames * len(self.failures) // self.num_starts).clamp(max=len(self.failures) - 1)
+        self.failures.mul_(self.decay).index_add_(0, bins, torch.ones_like(bins, dtype=torch.float32))
+        return next_tensordict
+
+
+class MotionEnd(Transform):
+    """Truncates episodes that reach the last frame of the reference; value estimates bootstrap through it.
+
+    Reads next `step_key`; writes `truncated` and `done`, and bool [N, 1] `completed`.
+    """
+
+    def __init__(self, reference: Reference, step_key: NestedKey = ("ref", "step")):
+        super().__init__(in_keys=[step_key], out_keys=["completed"])
+        self.last = reference.num_frames - 1
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        ended = next_tensordict.get(self.in_keys[0]) >= self.last
+        next_tensordict.set("completed", ended & ~next_tensordict.get("terminated"))
+        set_terminated(next_tensordict, ended, "truncated")
+        return next_tensordict
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        done = tensordict_reset.get("done")
+        tensordict_reset.set("completed", torch.zeros_like(done))
+        return tensordict_reset
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        flag = torch.zeros(*observation_spec.shape, 1, dtype=torch.bool, device=observation_spec.device)
+        observation_spec["completed"] = spec_like(flag)
+        return observation_spec
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        raise NotImplementedError("MotionEnd ends episodes and works in an environment only")

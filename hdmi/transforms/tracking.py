@@ -1,0 +1,214 @@
+"""What rewards, terminations and metrics compare: tracked bodies, tracking errors, contact points, feet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from hdmi.assets import Effector, g1, match_names
+from hdmi.functional import local_pose, quat_angle, quat_apply
+from hdmi.transforms.common import FunctionTransform, StateTransform
+
+_BODY_KEYS = ("body_pos", "body_quat", "body_lin_vel", "body_ang_vel")
+
+
+class TrackedBodies(FunctionTransform):
+    """Selects the robot's tracked bodies and adds their poses in the root's yaw frame at its ground projection.
+
+    Reads `robot/body_{pos, quat, lin_vel, ang_vel}` [N, B, *] and `robot/root_{pos, quat}`; writes the same for K
+    bodies under `tracked`, and `tracked/body_{pos, quat}_local` [N, K, *].
+
+    Args:
+        tracked_bodies: name patterns.
+        body_names: of the B bodies.
+    """
+
+    def __init__(self, tracked_bodies: Sequence[str], body_names: Sequence[str] = g1.BODY_NAMES):
+        outs = [("tracked", key) for key in (*_BODY_KEYS, "body_pos_local", "body_quat_local")]
+        ins = [("robot", key) for key in (*_BODY_KEYS, "root_pos", "root_quat")]
+        super().__init__(ins, outs)
+        index = torch.as_tensor(match_names(tracked_bodies, body_names, "tracked_bodies"))
+        self.register_buffer("index", index, persistent=False)
+
+    def function(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        bodies, (root_pos, root_quat) = inputs[:4], inputs[4:]
+        selected = [value[..., self.index, :] for value in bodies]
+        return (*selected, *local_pose(selected[0], selected[1], root_pos, root_quat))
+
+
+class Distance(FunctionTransform):
+    """Euclidean distance between vectors. [..., 3], [..., 3] -> [...], or [..., 1] if that drops the last dimension."""
+
+    def __init__(self, a_key: NestedKey, b_key: NestedKey, out_key: NestedKey):
+        super().__init__([a_key, b_key], [out_key])
+
+    def function(self, *inputs: Tensor) -> Tensor:
+        return _feature((inputs[0] - inputs[1]).norm(dim=-1), inputs[0])
+
+
+class Angle(FunctionTransform):
+    """Angle between orientations, rad. [..., 4], [..., 4] -> [...], or [..., 1] if that drops the last dimension."""
+
+    def __init__(self, a_key: NestedKey, b_key: NestedKey, out_key: NestedKey):
+        super().__init__([a_key, b_key], [out_key])
+
+    def function(self, *inputs: Tensor) -> Tensor:
+        return _feature(quat_angle(inputs[0], inputs[1]), inputs[0])
+
+
+class AbsoluteDifference(FunctionTransform):
+    """Absolute difference of scalars, of the selected columns if `index` is given. [..., J] -> [..., J']"""
+
+    def __init__(self, a_key: NestedKey, b_key: NestedKey, out_key: NestedKey, index: Sequence[int] | None = None):
+        super().__init__([a_key, b_key], [out_key])
+        self.register_buffer("index", None if index is None else torch.as_tensor(list(index)), persistent=False)
+
+    def function(self, *inputs: Tensor) -> Tensor:
+        difference = (inputs[0] - inputs[1]).abs()
+        return difference if self.index is None else difference[..., self.index]
+
+
+class JointErrors(AbsoluteDifference):
+    """Absolute error of the tracked joints. [..., 29], [..., 29] -> [..., J']
+
+    Args:
+        tracked_joints: name patterns.
+    """
+
+    def __init__(
+        self,
+        a_key: NestedKey,
+        b_key: NestedKey,
+        out_key: NestedKey,
+        tracked_joints: Sequence[str],
+        joint_names: Sequence[str] = g1.JOINT_NAMES,
+    ):
+        super().__init__(a_key, b_key, out_key, match_names(tracked_joints, joint_names, "tracked_joints"))
+
+
+def _feature(value: Tensor, source: Tensor) -> Tensor:
+    # [N, K] for K bodies, [N, 1] for a single pose
+    return value if source.ndim > 2 else value.unsqueeze(-1)
+
+
+class ContactPoints(FunctionTransform):
+    """End effectors and their contact points on the object, in the world.
+
+    Reads `robot/body_{pos, quat}` [N, B, *], `object/link_{pos, quat}` [N, *], `object/scale` [N, 1] and
+    `ref/contact_point` [N, E, 3] (link frame, m, scaled with the object);
+    writes `contact/eef_pos` and `contact/target_pos` [N, E, 3], m.
+    """
+
+    def __init__(self, effectors: Sequence[Effector], body_names: Sequence[str] = g1.BODY_NAMES):
+        super().__init__(
+            [
+                ("robot", "body_pos"),
+                ("robot", "body_quat"),
+                ("object", "link_pos"),
+                ("object", "link_quat"),
+                ("object", "scale"),
+                ("ref", "contact_point"),
+            ],
+            [("contact", "eef_pos"), ("contact", "target_pos")],
+        )
+        index = [match_names([e.body], body_names, "effectors")[0] for e in effectors]
+        self.register_buffer("index", torch.as_tensor(index), persistent=False)
+        points = torch.tensor([list(e.point) for e in effectors], dtype=torch.float32)
+        self.register_buffer("points", points, persistent=False)
+
+    def function(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        body_pos, body_quat, link_pos, link_quat, scale, points = inputs
+        eef = body_pos[..., self.index, :] + quat_apply(body_quat[..., self.index, :], self.points)
+        scaled = points * scale.unsqueeze(-1)
+        target = link_pos.unsqueeze(-2) + quat_apply(link_quat.unsqueeze(-2), scaled)
+        return eef, target
+
+
+class FeetState(StateTransform):
+    """Contact history of the feet, for the regularization rewards.
+
+    Reads next `robot/foot_force` [N, 2, 3]; writes under `feet`: `force`, `previous_force` [N, 2, 3], N;
+    `air_time` [N, 2], s, zero in contact; `swing_time` [N, 2], s, of the swing that ends in this step;
+    `touchdown` bool [N, 2].
+
+    Args:
+        control_dt: s. force_threshold: N, above which a foot is in contact.
+    """
+
+    def __init__(self, control_dt: float, force_threshold: float = 5.0):
+        super().__init__()
+        self.control_dt, self.force_threshold = control_dt, force_threshold
+
+    def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.zeros(*batch_size, *shape, dtype=dtype, device=device)
+
+        return {
+            ("feet", "force"): zeros(2, 3),
+            ("feet", "previous_force"): zeros(2, 3),
+            ("feet", "air_time"): zeros(2),
+            ("feet", "swing_time"): zeros(2),
+            ("feet", "touchdown"): zeros(2, dtype=torch.bool),
+        }
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        tensordict_reset = super()._reset(tensordict, tensordict_reset)
+        # the first step must not count the load of standing as an impact
+        force = tensordict_reset.get(("robot", "foot_force"))
+        tensordict_reset.set(("feet", "force"), force)
+        tensordict_reset.set(("feet", "previous_force"), force.clone())
+        return tensordict_reset
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        force = next_tensordict.get(("robot", "foot_force"))
+        air_time = tensordict.get(("feet", "air_time")) + self.control_dt
+        contact = force.norm(dim=-1) > self.force_threshold
+        touchdown = contact & (tensordict.get(("feet", "air_time")) > 0)
+        next_tensordict.set(("feet", "force"), force)
+        next_tensordict.set(("feet", "previous_force"), tensordict.get(("feet", "force")))
+        next_tensordict.set(("feet", "air_time"), air_time * ~contact)
+        next_tensordict.set(("feet", "swing_time"), air_time * touchdown)
+        next_tensordict.set(("feet", "touchdown"), touchdown)
+        return next_tensordict
+
+
+class Metrics(FunctionTransform):
+    """Averages tensors over their features for logs and evaluation, without influence on training.
+
+    Writes `metrics/<name>` [N, 1] = mean of the entry at `keys[name]` [N, K].
+    """
+
+    def __init__(self, keys: Mapping[str, NestedKey | Sequence[str]]):
+        in_keys = [key if isinstance(key, str) else tuple(key) for key in keys.values()]
+        super().__init__(in_keys, [("metrics", name) for name in keys])
+
+    def function(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        return tuple(value.float().mean(-1, keepdim=True) for value in inputs)
+
+
+class ContactMade(FunctionTransform):
+    """Share of the intended contacts that are made: the effector touches the object with some force.
+
+    Reads `contact/force` [N, E, 3] and `ref/contact` bool [N, E]; writes `contact/made` and `contact/intended`
+    [N, E], 0 or 1.
+
+    Args:
+        min_force: N, as in the lost-contact termination.
+    """
+
+    def __init__(
+        self,
+        min_force: float = 1.0,
+        force_key: NestedKey = ("contact", "force"),
+        active_key: NestedKey = ("ref", "contact"),
+    ):
+        super().__init__([force_key, active_key], [("contact", "made"), ("contact", "intended")])
+        self.min_force = min_force
+
+    def function(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        force, active = inputs
+        made = active & (force.norm(dim=-1) >= self.min_force)
+        return made.float(), active.float()
