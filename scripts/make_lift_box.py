@@ -34,11 +34,11 @@ REACH = (0.2, 1.1, 4.8, 5.7)
 PRESS = (1.1, 1.45, 4.5, 4.8)
 LIFT = (1.6, 2.5, 3.5, 4.4)
 
-BOX_X = 0.31  # of box and stand, ahead of the ankles, m
-LIFT_HEIGHT = 0.17  # m
+BOX_X = 0.32  # of box and stand, ahead of the ankles, m
+LIFT_HEIGHT = 0.15  # m
 CLEARANCE = 0.05  # between palm and box before the palms close in, m
-SQUEEZE = 0.013  # how far inside the box's sides the palms are while they hold it, m
-HAND_PITCH = 0.2  # fingers down while at the box, rad
+SQUEEZE = 0.015  # how far inside the box's sides the palms are while they hold it, m
+HAND_PITCH = 0.1  # fingers down while at the box, rad
 
 FOOT_Y = 0.119  # m
 ANKLE_HEIGHT = -g1.FOOT_POINTS[0][2] + g1.FOOT_POINT_RADIUS  # soles on the floor
@@ -72,7 +72,7 @@ class HandPath:
 
 def load_task(path: Path) -> Task:
     """Reads box, stand and effectors from a task's configuration."""
-    config = instantiate(OmegaConf.load(path), _convert_="all")
+    config = instantiate(OmegaConf.select(OmegaConf.load(path), "task"), _convert_="all")
     return Task(box=config["object"], stand=config["scenery"][0], effectors=tuple(config["effectors"]))
 
 
@@ -98,13 +98,17 @@ class Solver:
         self.limits = [mink.ConfigurationLimit(model, min_distance_from_limits=LIMIT_MARGIN)]
         home = np.concatenate([[0.0, 0.0, PELVIS_HEIGHT, 1.0, 0.0, 0.0, 0.0], default_joint_pos()])
         self.configuration.update(home)
-        self.com = mink.ComTask([2.0, 2.0, 0.0])
-        self.hands = {name: _frame(name, 5.0, 1.5) for name in ("left_wrist_yaw_link", "right_wrist_yaw_link")}
+        self.com = mink.ComTask([10.0, 10.0, 0.0])
+        self.hands = {name: _frame(name, 10.0, 3.0) for name in ("left_wrist_yaw_link", "right_wrist_yaw_link")}
         self.feet = _feet_tasks()
         self.fixed = [*_upright_tasks(), _posture_task(model, home)]
 
     def solve(self, com: np.ndarray, hands: dict[str, mink.SE3]) -> np.ndarray:
-        """Positions of the robot model with the centre of mass at `com` and the given bodies at their poses. [36]"""
+        """Positions of the robot model with the centre of mass at `com` and the given bodies at their poses. [36]
+
+        Raises:
+            RuntimeError: if the iteration does not settle: the poses are out of comfortable reach.
+        """
         self.com.set_target(com)
         tasks = [*self.fixed, self.com]
         for name, pose in hands.items():
@@ -115,9 +119,9 @@ class Solver:
                 self.configuration, tasks, 1.0, "daqp", damping=1e-4, limits=self.limits, constraints=self.feet
             )
             self.configuration.integrate_inplace(velocity, 1.0)
-            if np.abs(velocity).max() < 1e-7:
-                break
-        return self.configuration.q.copy()
+            if np.abs(velocity).max() < 2e-5:
+                return self.configuration.q.copy()
+        raise RuntimeError(f"inverse kinematics does not settle: last step {np.abs(velocity).max():.1e} rad")
 
 
 def _frame(name: str, position_cost: float | list[float], orientation_cost: float) -> mink.FrameTask:
@@ -152,7 +156,7 @@ def _upright_tasks() -> list[mink.FrameTask]:
 
 
 def _posture_task(model: mujoco.MjModel, home: np.ndarray) -> mink.PostureTask:
-    task = mink.PostureTask(model, cost=0.05)
+    task = mink.PostureTask(model, cost=0.02)
     task.set_target(home)
     return task
 

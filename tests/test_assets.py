@@ -257,7 +257,7 @@ class TestObjects:
         hinge = HingeConfig(
             name="door_joint",
             body="leaf",
-            geoms=[{"box": (0.4, 0.02, 1.0), "pos": (0.4, 0.0, 1.0)}],
+            geoms=[{"box": (0.4, 0.02, 1.0), "pos": (0.4, 0.0, 1.1)}],
             pos=(0.1, 0.0, 0.0),
             range=(0.0, 1.2),
             friction=0.7,
@@ -281,7 +281,7 @@ class TestObjects:
         data.qpos[scene.object_hinge_qpos] = 1.0
         mujoco.mj_kinematics(model, data)
         centre = data.xipos[scene.object_link]
-        np.testing.assert_allclose(centre, [3.1 + 0.4 * np.cos(1), 0.4 * np.sin(1), 1.0], atol=1e-9)
+        np.testing.assert_allclose(centre, [3.1 + 0.4 * np.cos(1), 0.4 * np.sin(1), 1.1], atol=1e-9)
 
     def test_floating_articulated_object_keeps_its_mass(self):
         config = ObjectConfig("chair", [BOX], mass=4.0, hinge={"name": "fold", "body": "back", "geoms": [BOX]})
@@ -298,8 +298,14 @@ class TestObjects:
 
     @pytest.mark.parametrize(
         "geom",
-        [{"box": (0.1, 0.0, 0.1)}, {"sphere": -0.1}, {"capsule": (0.1, -0.2)}, {"box": (0.1, 0.1, 0.1, 0.1)}, {}]
-        + [{"box": (0.1, 0.1, 0.1), "sphere": 0.1}],
+        [
+            {},
+            {"box": (0.1, 0.1, 0.1), "sphere": 0.1},
+            {"box": (0.1, 0.0, 0.1)},
+            {"box": (0.1, 0.1, 0.1, 0.1)},
+            {"sphere": -0.1},
+            {"capsule": (0.1, -0.2)},
+        ],
     )
     def test_bad_geom_is_an_error_that_names_it(self, geom):
         with pytest.raises(ValueError, match="crate geom 1"):
@@ -353,7 +359,7 @@ class TestMeshes:
         assert 0.5 < scene.model.body_ipos[scene.object_body][0] < 0.8  # the ball has a third of the volume
 
     def test_missing_file_is_an_error(self):
-        with pytest.raises(FileNotFoundError, match="no file nowhere.obj"):
+        with pytest.raises(FileNotFoundError, match=r"no file nowhere\.obj"):
             scene_with(ObjectConfig("crate", [{"mesh": "nowhere.obj"}]))
 
     def test_flat_mesh_is_an_error(self, tmp_path):
@@ -380,7 +386,7 @@ class TestScene:
         assert model.body("table").dofnum[0] == 0
 
     def test_scenery_without_a_place_is_an_error(self):
-        with pytest.raises(ValueError, match="scenery 'table': .*give it a pos"):
+        with pytest.raises(ValueError, match=r"scenery 'table': .*give it a pos"):
             scene_with(scenery=[SceneryConfig("table", [BOX])])
 
     def test_effector_must_be_a_robot_body(self):

@@ -90,7 +90,9 @@ class ObjectConfig:
     rgba: Sequence[float] = (0.80, 0.56, 0.30, 1.0)
 
     def __post_init__(self) -> None:
-        if not self.mass > 0:
+        if not self.geoms:
+            raise ValueError(f"object {self.name!r}: has no geoms")
+        if not (self.mass > 0 and np.isfinite(self.mass)):
             raise ValueError(f"object {self.name!r}: mass must be positive, got {self.mass}")
         if self.hinge is not None and not isinstance(self.hinge, HingeConfig):
             object.__setattr__(self, "hinge", HingeConfig(**self.hinge))
@@ -120,6 +122,8 @@ _SHAPES = {
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
 }
+
+_NUM_SIZES = {"box": 3, "sphere": 1, "capsule": 2, "cylinder": 2}
 
 
 def load_mesh(path: str, scale: Any = 1.0) -> trimesh.Trimesh:
@@ -186,13 +190,14 @@ def add_geoms(
             name = f"{body.name}_mesh{i}"
             spec.add_mesh(name=name, uservert=mesh.vertices.ravel().tolist(), userface=mesh.faces.ravel().tolist())
             # MuJoCo re-centres a mesh at its centre of mass and undoes that in the geom's pose
-            added.append((body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **kwargs), mesh.volume))
+            added.append((body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **kwargs), mesh.convex_hull.volume))
             continue
-        size = np.zeros(3)
         values = np.atleast_1d(np.asarray(getattr(config, shapes[0]), float))
+        if values.shape != (_NUM_SIZES[shapes[0]],) or not (np.isfinite(values) & (values > 0)).all():
+            expected = f"{_NUM_SIZES[shapes[0]]} positive sizes"
+            raise ValueError(f"{where}: {shapes[0]}: {expected} expected, got {values.tolist()}")
+        size = np.zeros(3)
         size[: len(values)] = values
-        if (values <= 0).any():
-            raise ValueError(f"{where}: sizes must be positive, got {values.tolist()}")
         added.append((body.add_geom(type=_SHAPES[shapes[0]], size=size, **kwargs), _volume(shapes[0], values)))
     if mass is not None:
         total = sum(volume for _, volume in added)

@@ -45,6 +45,13 @@ _SHELLS: tuple[tuple[str, g1.Vec, g1.Vec, float, g1.Vec], ...] = (
     ),
 )
 
+# Bodies whose collision shapes overlap at every joint angle without being parent and child.
+_ALWAYS_TOUCHING: tuple[tuple[str, str], ...] = tuple(
+    pair
+    for side in ("left", "right")
+    for pair in (("pelvis", f"{side}_hip_roll_link"), (f"{side}_elbow_link", f"{side}_wrist_pitch_link"))
+)
+
 
 @dataclass(frozen=True)
 class RobotConfig:
@@ -153,6 +160,8 @@ def add_robot(spec: mujoco.MjSpec, config: RobotConfig) -> None:
     for site in g1.SITES:
         bodies[site.body].add_site(name=site.name, pos=site.pos, size=[0.01, 0.01, 0.01], group=5)
     _add_collision(bodies, config)
+    for first, second in _ALWAYS_TOUCHING:
+        spec.add_exclude(bodyname1=first, bodyname2=second)
     if config.mesh_dir is None:
         _add_shells(bodies, config)
     else:

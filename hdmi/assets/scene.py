@@ -63,6 +63,7 @@ class Scene:
     model: mujoco.MjModel
     sim: SimConfig
     effectors: tuple[Effector, ...]
+    default_qpos: np.ndarray  # [nq] standing robot, object where it was placed
     body_ids: np.ndarray  # [B] robot bodies in table order
     joint_qpos: np.ndarray  # [J] addresses
     joint_dof: np.ndarray  # [J]
@@ -104,6 +105,7 @@ def build_scene(
     if effectors and object is None:
         raise ValueError("effectors: the task has no object to touch")
     spec = mujoco.MjSpec()
+    spec.compiler.degree = False
     _set_options(spec, sim)
     _add_floor(spec)
     add_robot(spec, robot)
@@ -120,8 +122,10 @@ def build_scene(
     model = spec.compile()
 
     joint_ids = [model.joint(name).id for name in g1.JOINT_NAMES]
-    model.qpos0[2] = g1.ROOT_HEIGHT
-    model.qpos0[model.jnt_qposadr[joint_ids]] = default_joint_pos()
+    # not in model.qpos0: hinges turn by qpos - qpos0
+    default_qpos = model.qpos0.copy()
+    default_qpos[2] = g1.ROOT_HEIGHT
+    default_qpos[model.jnt_qposadr[joint_ids]] = default_joint_pos()
     link = None if object is None else model.body(object.link).id
     hinge = None if object is None or object.hinge is None else model.joint(object.hinge.name).id
     free = None if object is None or object.fixed_base else model.joint("object_root").id
@@ -130,6 +134,7 @@ def build_scene(
         model=model,
         sim=sim,
         effectors=tuple(effectors),
+        default_qpos=default_qpos,
         body_ids=np.array([model.body(name).id for name in g1.BODY_NAMES]),
         joint_qpos=model.jnt_qposadr[joint_ids].copy(),
         joint_dof=model.jnt_dofadr[joint_ids].copy(),

@@ -36,10 +36,10 @@ class HumanoidObjectEnv(EnvBase):
         `robot/{joint_pos, joint_vel, joint_torque, joint_target}` [N, 29];
         `robot/{root_pos, root_lin_vel, root_ang_vel}` [N, 3]; `robot/root_quat` [N, 4];
         `robot/{body_pos, body_lin_vel, body_ang_vel}` [N, B, 3]; `robot/body_quat` [N, B, 4];
-        `robot/foot_force` [N, 2, 3], N;
+        `robot/foot_force` [N, 2, 3], N, on the feet;
         with an object: `object/{pos, lin_vel, ang_vel, link_pos}` [N, 3], `object/{quat, link_quat}` [N, 4] (the
         link carries the contact points; for a rigid object it is the object), `object/{joint_pos, joint_vel}`
-        [N, K], `object/{scale, mass, friction}` [N, 1]; `contact/force` [N, E, 3], N;
+        [N, K], `object/{scale, mass, friction}` [N, 1]; `contact/force` [N, E, 3], N, of the object on the effectors;
         `diverged` bool [N, 1]; `pixels` uint8 [N, H, W, 3] if asked for.
 
     Reads on reset, all optional, under `init`: `root_pos`, `root_quat`, `root_lin_vel`, `root_ang_vel` (world),
@@ -72,7 +72,7 @@ class HumanoidObjectEnv(EnvBase):
         model = scene.model
         self._object_scale = torch.ones(num_envs, 1)
         self._geom_base = {f: torch.from_numpy(getattr(model, f).copy()) for f in ("geom_size", "geom_pos")}
-        self._qpos0 = torch.from_numpy(model.qpos0.copy())
+        self._default_qpos = torch.from_numpy(scene.default_qpos)
         self._joint_qpos = _slice(scene.joint_qpos)
         self._joint_dof = _slice(scene.joint_dof)
         self._body = _slice(scene.body_ids)
@@ -193,7 +193,7 @@ class HumanoidObjectEnv(EnvBase):
         init = TensorDict({}, batch_size=self.batch_size) if init is None else init
         self._write_model(mask, init)
         backend.reset(mask)
-        qpos, qvel = self._qpos0.expand(self.num_envs, -1).clone(), torch.zeros_like(backend.data("qvel"))
+        qpos, qvel = self._default_qpos.expand(self.num_envs, -1).clone(), torch.zeros_like(backend.data("qvel"))
 
         def write(target: Tensor, where: slice | int | None, key: str) -> None:
             value = init.get(key, None)
@@ -262,7 +262,8 @@ class HumanoidObjectEnv(EnvBase):
             "body_quat": xquat[:, self._body],
             "body_lin_vel": lin_vel[:, self._body],
             "body_ang_vel": ang_vel[:, self._body],
-            "foot_force": sensors[:, torch.from_numpy(scene.foot_sensors)],
+            # the sensors report what the robot exerts; what it feels is the opposite
+            "foot_force": -sensors[:, torch.from_numpy(scene.foot_sensors)],
         }
         robot |= {f"root_{key}": robot[f"body_{key}"][:, 0] for key in ("pos", "quat", "lin_vel", "ang_vel")}
         n, bs = self.num_envs, self.batch_size
@@ -283,7 +284,7 @@ class HumanoidObjectEnv(EnvBase):
                 "mass": self._object_model("body_mass", [body, link]),
                 "friction": self._object_model("geom_friction", [int(scene.object_geoms[-1])]),
             }
-            force = sensors[:, torch.from_numpy(scene.effector_sensors)]
+            force = -sensors[:, torch.from_numpy(scene.effector_sensors)]
             state["object"] = TensorDict(object_, batch_size=bs, device=self.device)
             state["contact"] = TensorDict({"force": force}, batch_size=bs, device=self.device)
         out = TensorDict(state, batch_size=bs, device=self.device)

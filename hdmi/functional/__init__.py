@@ -21,7 +21,7 @@ from hdmi.functional.rotation import (
     yaw_quat,
 )
 from hdmi.functional.termination import contact_lost, error_exceeds, persist
-from hdmi.functional.tracking import body_velocity, local_pose
+from hdmi.functional.pose import body_velocity, local_pose
 
 __all__ = [
     "action_rate",

@@ -16,6 +16,7 @@ from hdmi.assets.robot import RobotConfig, add_robot
 def robot_model() -> mujoco.MjModel:
     """The robot alone: 7 + 29 positions, bodies in table order after the world."""
     spec = mujoco.MjSpec()
+    spec.compiler.degree = False
     add_robot(spec, RobotConfig())
     return spec.compile()
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -83,7 +84,7 @@ def load_motion(path: str | Path) -> Motion:
     try:
         with np.load(npz_path, allow_pickle=False) as file:
             arrays = {key: file[key] for key in file.files}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise MotionError(f"{npz_path}: truncated or not an npz of plain arrays: {error}") from error
     for key in _REQUIRED:
         if key not in arrays:
@@ -97,10 +98,11 @@ def load_motion(path: str | Path) -> Motion:
             continue
         shape = (num_frames, len(joint_names)) if width is None else (num_frames, len(body_names), width)
         values[key] = _checked(npz_path, key, arrays[key], shape)
-    norms = np.linalg.norm(values["body_quat_w"], axis=-1)
+    norms = np.linalg.norm(values["body_quat_w"].astype(np.float64), axis=-1)
     if (bad := np.argwhere(np.abs(norms - 1) > 1e-2)).size:
         t, b = bad[0]
         raise MotionError(f"{npz_path}: body_quat_w: norm {norms[t, b]:.3f} at frame {t}, body {body_names[b]!r}")
+    norms[np.abs(norms - 1) < 1e-6] = 1.0  # unit as far as float32 can tell: leave the bits alone
     values["body_quat_w"] = (values["body_quat_w"] / norms[..., None]).astype(np.float32)
     values.setdefault("body_lin_vel_w", derivative(values["body_pos_w"], fps).astype(np.float32))
     values.setdefault("body_ang_vel_w", angular_velocity(values["body_quat_w"], fps).astype(np.float32))
@@ -109,7 +111,7 @@ def load_motion(path: str | Path) -> Motion:
     if "object_contact" in arrays:
         raw = arrays["object_contact"]
         raw = raw[:, None] if raw.ndim == 1 else raw
-        raw = _checked(npz_path, "object_contact", raw, (num_frames, raw.shape[-1]))
+        raw = _checked(npz_path, "object_contact", raw, (num_frames, *raw.shape[1:2]))
         if (bad := np.argwhere((raw != 0) & (raw != 1))).size:
             raise MotionError(
                 f"{npz_path}: object_contact: {raw[tuple(bad[0])]} at frame {bad[0][0]} is neither 0 nor 1"

@@ -15,6 +15,7 @@ from hdmi.assets import Effector, ObjectConfig, SceneryConfig, default_joint_pos
 from hdmi.motion.kinematics import angular_velocity, derivative, forward_kinematics
 from hdmi.motion.motion import Motion, MotionError, load_motion
 
+_ROOT_JOINT = "root"  # a column that some tools write for the free joint; nothing reads it
 _EMBEDDED = Path(__file__).parent / "references"
 
 
@@ -95,7 +96,7 @@ def make_reference(
     if "pelvis" not in motion.body_names:
         raise MotionError(f"{where}: body_names lacks the root 'pelvis'")
     hinge = object.hinge.name if object is not None and object.hinge is not None else None
-    unknown = [name for name in motion.joint_names if name not in g1.JOINT_NAMES and name != hinge]
+    unknown = [name for name in motion.joint_names if name not in (*g1.JOINT_NAMES, _ROOT_JOINT, hinge)]
     if unknown:
         raise MotionError(f"{where}: joint_names: {unknown} are neither the robot's nor the object's hinge ({hinge!r})")
     if not any(name in g1.JOINT_NAMES for name in motion.joint_names):

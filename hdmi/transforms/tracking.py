@@ -178,12 +178,12 @@ class FeetState(StateTransform):
 class Metrics(FunctionTransform):
     """Averages tensors over their features for logs and evaluation, without influence on training.
 
-    Writes `metrics/<name>` [N, 1] = mean of the entry at `keys[name]` [N, K].
+    Writes `metrics/<name>` [N, 1] = mean of the entry at `keys[name]` [N, K]; names without a key are left out.
     """
 
-    def __init__(self, keys: Mapping[str, NestedKey | Sequence[str]]):
-        in_keys = [key if isinstance(key, str) else tuple(key) for key in keys.values()]
-        super().__init__(in_keys, [("metrics", name) for name in keys])
+    def __init__(self, keys: Mapping[str, NestedKey | Sequence[str] | None]):
+        given = {name: key if isinstance(key, str) else tuple(key) for name, key in keys.items() if key is not None}
+        super().__init__(list(given.values()), [("metrics", name) for name in given])
 
     def function(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         return tuple(value.float().mean(-1, keepdim=True) for value in inputs)

@@ -1,0 +1,218 @@
+"""From a config to an environment: every part is a node with a `_target_`, every transform stands in one list."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from hydra.utils import get_class
+from omegaconf import DictConfig, OmegaConf
+from rich.table import Table
+from torchrl.envs import CatTensors, Compose, ExcludeTransform, Transform, TransformedEnv
+
+from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene
+from hdmi.envs import BatchBackend, HumanoidObjectEnv
+from hdmi.motion import Reference, find_motion, make_reference
+
+# What leaves the stack besides the state that steps read back.
+OUTPUTS = ("policy", "critic", "metrics", "termination", "completed", "diverged", "episode_reward", "step_count", "pixels")
+
+
+class ConfigError(ValueError):
+    """A config that cannot be built; the message names the node."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a config's task, robot and sim nodes describe."""
+
+    name: str
+    scene: Scene
+    reference: Reference
+
+
+def build(node: Any, where: str, **context: Any) -> Any:
+    """Instantiates a config node `{_target_: class, parameter: value, ...}`; lists become tuples.
+
+    Args:
+        context: values for parameters of the class that the node does not give.
+
+    Raises:
+        ConfigError: for an unknown class or parameter, or values that the class refuses; names the node.
+    """
+    values = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else dict(node)
+    assert isinstance(values, dict)
+    path = values.pop("_target_", None)
+    if path is None:
+        raise ConfigError(f"{where}: has no _target_")
+    try:
+        cls = get_class(path)
+    except Exception as error:
+        raise ConfigError(f"{where}: _target_ {path!r}: {error}") from error
+    kwargs = {key: _plain(value, f"{where}.{key}") for key, value in values.items()}
+    parameters = inspect.signature(cls).parameters
+    kwargs |= {key: value for key, value in context.items() if key in parameters and key not in kwargs}
+    if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()) and (unknown := set(kwargs) - set(parameters)):
+        raise ConfigError(f"{where}: {cls.__name__} has no {sorted(unknown)}; it takes {sorted(parameters)}")
+    try:
+        return cls(**kwargs)
+    except (TypeError, ValueError, KeyError) as error:
+        raise ConfigError(f"{where} ({cls.__name__}): {error}") from error
+
+
+def _plain(value: Any, where: str) -> Any:
+    if isinstance(value, dict):
+        if "_target_" in value:
+            return build(value, where)
+        return {key: _plain(item, f"{where}.{key}") for key, item in value.items()}
+    if isinstance(value, list):
+        return tuple(_plain(item, f"{where}[{i}]") for i, item in enumerate(value))
+    return value
+
+
+def _dataclass(cls: type, node: Any, where: str) -> Any:
+    values = OmegaConf.to_container(node, resolve=True)
+    assert isinstance(values, dict)
+    names = {f.name for f in fields(cls)}
+    if unknown := set(values) - names:
+        raise ConfigError(f"{where}: unknown {sorted(map(str, unknown))}; there is {sorted(names)}")
+    return cls(**values)
+
+
+def make_task(cfg: DictConfig) -> Task:
+    """Loads the reference and compiles the scene of a config.
+
+    Raises:
+        ConfigError, MotionError: for a node or a motion that cannot be used.
+    """
+    robot = _dataclass(RobotConfig, cfg.robot, "robot")
+    sim = _dataclass(SimConfig, cfg.sim, "sim")
+    task = cfg.task
+    object_ = None if task.object is None else build(task.object, "task.object")
+    scenery = [build(item, f"task.scenery[{i}]") for i, item in enumerate(task.scenery)]
+    effectors = [build(item, f"task.effectors[{i}]") for i, item in enumerate(task.effectors)]
+    reference = make_reference(
+        find_motion(task.motion, cfg.motion_root),
+        control_dt=sim.control_dt,
+        object=object_,
+        scenery=scenery,
+        effectors=effectors,
+    )
+    try:
+        scene = build_scene(robot, sim, object_, scenery, effectors, reference.placements)
+    except ValueError as error:
+        raise ConfigError(f"task {task.name!r}: {error}") from error
+    return Task(task.name, scene, reference)
+
+
+def make_env(
+    cfg: DictConfig,
+    num_envs: int | None = None,
+    task: Task | None = None,
+    pixels: tuple[int, int] | None = None,
+    backend: Callable[..., Any] | None = None,
+) -> TransformedEnv:
+    """The environment of a config: the base environment under the transforms that `cfg.stack` lists.
+
+    Args:
+        num_envs: instead of the config's.
+        task: made from the config if absent.
+    """
+    task = make_task(cfg) if task is None else task
+    threads = cfg.num_threads
+
+    def default_backend(model: Any, count: int) -> BatchBackend:
+        return BatchBackend(model, count, threads)
+
+    base = HumanoidObjectEnv(task.scene, num_envs or cfg.num_envs, backend or default_backend, pixels)
+    env = TransformedEnv(base, Compose())
+    for _, transform in make_transforms(cfg, task):
+        env.append_transform(transform)
+    # raw keys are dropped, but for what steps read back and what learners and logs want
+    state = set(env.full_state_spec.keys(True, True))
+    entries = list(env.full_observation_spec.keys(True, True))
+    kept = {key for key in entries if key in state or _top(key) in OUTPUTS}
+    kept_tops = {_top(key) for key in kept}
+    # whole branches where nothing in them is kept, else leaf by leaf
+    spare = {key if _top(key) in kept_tops else _top(key) for key in entries if key not in kept}
+    env.append_transform(ExcludeTransform(*spare))
+    return env
+
+
+def _top(key: Any) -> str:
+    return key if isinstance(key, str) else key[0]
+
+
+def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
+    """The transforms of a config with the names of their nodes, from the base environment outwards."""
+    context = {
+        "reference": task.reference,
+        "model": task.scene.model,
+        "effectors": task.scene.effectors,
+        "control_dt": task.scene.sim.control_dt,
+        "decimation": task.scene.sim.decimation,
+    }
+    stack: list[tuple[str, Transform]] = []
+    for group in cfg.stack:
+        if group not in cfg:
+            raise ConfigError(f"stack: the config has no group {group!r}")
+        if group == "observation":
+            stack += _observations(cfg, context)
+            continue
+        for name, node in (cfg[group] or {}).items():
+            if node is not None:
+                where = f"{group}.{name}"
+                stack.append((where, build(node, where, name=name, **context)))
+    return stack
+
+
+def _observations(cfg: DictConfig, context: Mapping[str, Any]) -> list[tuple[str, Transform]]:
+    def terms(group: str) -> list[str]:
+        return [str(name) for name, node in (cfg.observation[group] or {}).items() if node is not None]
+
+    stack: list[tuple[str, Transform]] = []
+    for group in ("policy", "privileged"):
+        for name in terms(group):
+            where = f"observation.{group}.{name}"
+            stack.append((where, build(cfg.observation[group][name], where, out_key=("obs", name), **context)))
+    policy = [("obs", name) for name in terms("policy")]
+    privileged = [("obs", name) for name in terms("privileged")]
+
+    def cat(keys: list[tuple[str, str]], out_key: str) -> CatTensors:
+        return CatTensors(in_keys=keys, out_key=out_key, dim=-1, del_keys=False, sort=False)
+
+    stack.append(("observation.critic", cat(policy + privileged, "critic")))
+    for name, node in (cfg.noise or {}).items():
+        if node is not None:
+            stack.append((f"noise.{name}", build(node, f"noise.{name}", **context)))
+    stack.append(("observation.policy", cat(policy, "policy")))
+    return stack
+
+
+def describe(transforms: list[tuple[str, Transform]]) -> Table:
+    """The transform stack as a table: node, class, keys read and written, weight."""
+    table = Table(title="Transform stack, from the base environment outwards", title_justify="left")
+    for column in ("node", "transform", "reads", "writes", "weight"):
+        table.add_column(column, justify="right" if column == "weight" else "left", overflow="fold")
+
+    def text(keys: Any) -> str:
+        shown = [key if isinstance(key, str) else "/".join(key) for key in keys or []]
+        return ", ".join(shown[:4]) + (f", ... ({len(shown)})" if len(shown) > 4 else "")
+
+    for name, transform in transforms:
+        reads = [*(transform.in_keys or []), *getattr(transform, "state_keys", []), *(transform.in_keys_inv or [])]
+        writes = [*(transform.out_keys or []), *(transform.out_keys_inv or [])]
+        weight = getattr(transform, "weight", None)
+        table.add_row(
+            name, type(transform).__name__, text(reads), text(writes), "" if weight is None else f"{weight:g}"
+        )
+    return table
+
+
+def set_threads(count: int) -> None:
+    """Threads of torch; 0 leaves its choice."""
+    if count:
+        torch.set_num_threads(count)
