@@ -11,14 +11,24 @@ import torch
 from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
-from torchrl.envs import CatTensors, Compose, ExcludeTransform, Transform, TransformedEnv
+from torchrl.envs import CatTensors, Compose, SelectTransform, Transform, TransformedEnv
 
 from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene
 from hdmi.envs import BatchBackend, HumanoidObjectEnv
 from hdmi.motion import Reference, find_motion, make_reference
 
 # What leaves the stack besides the state that steps read back.
-OUTPUTS = ("policy", "critic", "metrics", "termination", "completed", "diverged", "episode_reward", "step_count", "pixels")
+OUTPUTS = (
+    "policy",
+    "critic",
+    "metrics",
+    "termination",
+    "completed",
+    "diverged",
+    "episode_reward",
+    "step_count",
+    "pixels",
+)
 
 
 class ConfigError(ValueError):
@@ -134,11 +144,7 @@ def make_env(
     # raw keys are dropped, but for what steps read back and what learners and logs want
     state = set(env.full_state_spec.keys(True, True))
     entries = list(env.full_observation_spec.keys(True, True))
-    kept = {key for key in entries if key in state or _top(key) in OUTPUTS}
-    kept_tops = {_top(key) for key in kept}
-    # whole branches where nothing in them is kept, else leaf by leaf
-    spare = {key if _top(key) in kept_tops else _top(key) for key in entries if key not in kept}
-    env.append_transform(ExcludeTransform(*spare))
+    env.append_transform(SelectTransform(*(key for key in entries if key in state or _top(key) in OUTPUTS)))
     return env
 
 

@@ -90,7 +90,7 @@ class ObjectConfig:
     rgba: Sequence[float] = (0.80, 0.56, 0.30, 1.0)
 
     def __post_init__(self) -> None:
-        if not self.geoms:
+        if not self.geoms and self.hinge is None:
             raise ValueError(f"object {self.name!r}: has no geoms")
         if not (self.mass > 0 and np.isfinite(self.mass)):
             raise ValueError(f"object {self.name!r}: mass must be positive, got {self.mass}")
@@ -190,7 +190,9 @@ def add_geoms(
             name = f"{body.name}_mesh{i}"
             spec.add_mesh(name=name, uservert=mesh.vertices.ravel().tolist(), userface=mesh.faces.ravel().tolist())
             # MuJoCo re-centres a mesh at its centre of mass and undoes that in the geom's pose
-            added.append((body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **kwargs), mesh.convex_hull.volume))
+            added.append(
+                (body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **kwargs), mesh.convex_hull.volume)
+            )
             continue
         values = np.atleast_1d(np.asarray(getattr(config, shapes[0]), float))
         if values.shape != (_NUM_SIZES[shapes[0]],) or not (np.isfinite(values) & (values > 0)).all():
