@@ -138,9 +138,7 @@ def make_env(
         return BatchBackend(model, count, threads)
 
     base = HumanoidObjectEnv(task.scene, num_envs or cfg.num_envs, backend or default_backend, pixels)
-    env = TransformedEnv(base, Compose())
-    for _, transform in make_transforms(cfg, task):
-        env.append_transform(transform)
+    env = TransformedEnv(base, Compose(*(transform for _, transform in make_transforms(cfg, task))))
     # raw keys are dropped, but for what steps read back and what learners and logs want
     state = set(env.full_state_spec.keys(True, True))
     entries = list(env.full_observation_spec.keys(True, True))

@@ -1,5 +1,6 @@
 """Pure tensor functions: rotations, tracking errors, reward and termination kernels."""
 
+from hdmi.functional.pose import body_velocity, local_pose
 from hdmi.functional.reward import (
     action_rate,
     feet_air_time,
@@ -21,7 +22,6 @@ from hdmi.functional.rotation import (
     yaw_quat,
 )
 from hdmi.functional.termination import contact_lost, error_exceeds, persist
-from hdmi.functional.pose import body_velocity, local_pose
 
 __all__ = [
     "action_rate",

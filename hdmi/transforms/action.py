@@ -12,13 +12,12 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform
 
 from hdmi.assets import default_joint_pos, g1, match_names
-from hdmi.transforms.common import StateTransform, add_state_specs
+from hdmi.transforms.common import SpecTransform, StateTransform, add_state_specs
 
 
-class _ActionTransform(Transform):
+class _ActionTransform(SpecTransform):
     """Rewrites the action on its way to the environment with what the tensordict holds."""
 
     def __init__(self, action_key: NestedKey = "action", state_keys: Sequence[NestedKey] = ()):
@@ -38,12 +37,16 @@ class _ActionTransform(Transform):
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         input_spec = super().transform_input_spec(input_spec)
-        if self.state_keys and self.parent is not None:
+        declared = input_spec["full_state_spec"]
+        missing = [
+            key for key in self.state_keys if declared is None or unravel_key(key) not in declared.keys(True, True)
+        ]
+        if missing and self.parent is not None:
             have = self.parent.full_observation_spec
-            for key in self.state_keys:
+            for key in missing:
                 if unravel_key(key) not in have.keys(True, True):
                     raise KeyError(f"{type(self).__name__}: reads {key!r}, which nothing before it writes")
-            add_state_specs(input_spec, {key: have[unravel_key(key)].clone() for key in self.state_keys})
+            add_state_specs(input_spec, {key: have[unravel_key(key)].clone() for key in missing})
         return input_spec
 
 

@@ -26,7 +26,29 @@ def add_keys(spec: Composite, values: TensorDictBase, keys: Sequence[NestedKey])
     return spec
 
 
-class FunctionTransform(Transform):
+class SpecTransform(Transform):
+    """Base that edits specs in place.
+
+    TorchRL's Transform copies all specs for each transform, which makes building a stack of n transforms over m keys
+    cost n m tensors of the batch's size; the environment has copied them once already.
+    """
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        for name, transform in (
+            ("full_observation_spec", self.transform_observation_spec),
+            ("full_reward_spec", self.transform_reward_spec),
+            ("full_done_spec", self.transform_done_spec),
+        ):
+            output_spec[name] = transform(output_spec[name])
+        return output_spec
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        input_spec["full_state_spec"] = self.transform_state_spec(input_spec["full_state_spec"])
+        input_spec["full_action_spec"] = self.transform_action_spec(input_spec["full_action_spec"])
+        return input_spec
+
+
+class FunctionTransform(SpecTransform):
     """Writes `out_keys = function(*in_keys)` after every step and reset; specs follow from the function."""
 
     def __init__(self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]):
@@ -60,7 +82,7 @@ class FunctionTransform(Transform):
         return add_keys(observation_spec, self._call(inputs), self.out_keys)
 
 
-class StateTransform(Transform):
+class StateTransform(SpecTransform):
     """Base of transforms that carry state from step to step in the tensordict, never in themselves.
 
     Subclasses give `initial_state`; its keys become observation keys (so that they travel on) and state keys (so

@@ -8,7 +8,6 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import Composite
-from torchrl.envs import Transform
 
 from hdmi.assets import default_joint_pos
 from hdmi.functional import (
@@ -19,7 +18,7 @@ from hdmi.functional import (
     quat_multiply,
     quat_to_rot6d,
 )
-from hdmi.transforms.common import FunctionTransform, add_state_specs, spec_like
+from hdmi.transforms.common import FunctionTransform, SpecTransform, add_state_specs, spec_like
 
 _ROOT_POS: NestedKey = ("robot", "root_pos")
 _ROOT_QUAT: NestedKey = ("robot", "root_quat")
@@ -154,12 +153,13 @@ class UniformNoise(FunctionTransform):
         return value + (2 * torch.rand_like(value) - 1) * self.scale
 
 
-class _EntryState(Transform):
+class _EntryState(SpecTransform):
     """Base of transforms that rewrite an entry with state of their own, whose shape follows from the entry."""
 
     def __init__(self, key: NestedKey, state_key: NestedKey):
         super().__init__(in_keys=[key], out_keys=[key])
         self.state_key = state_key
+        self._features: torch.Size | None = None  # of the entry, once specs have been asked for
 
     def fresh_state(self, value: Tensor) -> Tensor:
         """State of a new episode that starts with this value of the entry."""
@@ -184,6 +184,7 @@ class _EntryState(Transform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         value = observation_spec[self.in_keys[0]].zero()
+        self._features = value.shape[len(observation_spec.shape) :]
         value, state = self.update(value, self.fresh_state(value))
         observation_spec[self.in_keys[0]] = spec_like(value)
         observation_spec[self.state_key] = spec_like(state)
@@ -191,8 +192,11 @@ class _EntryState(Transform):
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         input_spec = super().transform_input_spec(input_spec)
-        if self.parent is not None:
-            value = self.parent.full_observation_spec[self.in_keys[0]].zero()
+        if self._features is None and self.parent is not None:
+            value = self.parent.full_observation_spec[self.in_keys[0]]
+            self._features = value.shape[len(input_spec.shape) :]
+        if self._features is not None:
+            value = torch.zeros(*input_spec.shape, *self._features, device=input_spec.device)
             add_state_specs(input_spec, {self.state_key: spec_like(self.fresh_state(value))})
         return input_spec
 

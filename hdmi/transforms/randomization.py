@@ -14,17 +14,17 @@ import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import Transform
 
 from hdmi.assets import g1, match_names
 from hdmi.transforms.action import _ActionStateTransform
+from hdmi.transforms.common import SpecTransform
 
 
 def _between(low: float, high: float, shape: Sequence[int], device: torch.device | None) -> Tensor:
     return low + (high - low) * torch.rand(tuple(shape), device=device)
 
 
-class ModelRandomization(Transform):
+class ModelRandomization(SpecTransform):
     """Base of terms that draw model fields.
 
     Args:

@@ -9,12 +9,11 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
-from torchrl.envs import Transform
 
 from hdmi.assets import g1, match_names
 from hdmi.functional import local_pose, quat_from_euler, quat_multiply
 from hdmi.motion import Reference
-from hdmi.transforms.common import StateTransform, set_terminated, spec_like
+from hdmi.transforms.common import SpecTransform, StateTransform, add_state_specs, set_terminated, spec_like
 
 FRAME_KEY: NestedKey = ("init", "frame")
 
@@ -74,11 +73,11 @@ class MotionReference(StateTransform):
         return self._lookup(torch.zeros(*batch_size, 1, dtype=torch.int64, device=device))
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
-        # only the clock is read back
-        step = torch.zeros(*input_spec.shape, 1, dtype=torch.int64, device=input_spec.device)
-        input_spec = Transform.transform_input_spec(self, input_spec)
-        input_spec["full_state_spec", "ref", "step"] = spec_like(step)
-        return input_spec
+        # only the clock is read back by this transform, and the joint positions by residual actions
+        state = self.initial_state(input_spec.shape, input_spec.device)
+        return add_state_specs(
+            input_spec, {key: spec_like(state[key]) for key in (("ref", "step"), ("ref", "joint_pos"))}
+        )
 
     def _write(self, tensordict: TensorDictBase, step: Tensor) -> TensorDictBase:
         for key, value in self._lookup(step).items():
@@ -133,7 +132,7 @@ def _reference_table(
     return table
 
 
-class ReferenceStateInitialization(Transform):
+class ReferenceStateInitialization(SpecTransform):
     """Starts episodes from frames of the reference with small random perturbations (section III-B, (1)).
 
     Writes on reset, before the base environment resets: `init/frame` and the state under `init` that
@@ -263,7 +262,7 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
         return next_tensordict
 
 
-class MotionEnd(Transform):
+class MotionEnd(SpecTransform):
     """Truncates episodes that reach the last frame of the reference; value estimates bootstrap through it.
 
     Reads next `step_key`; writes `truncated` and `done`, and bool [N, 1] `completed`.

@@ -9,10 +9,10 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorSpec
-from torchrl.envs import Transform
 
 from hdmi import functional as F
 from hdmi.assets import g1, match_names
+from hdmi.transforms.common import SpecTransform
 
 
 def _keys(keys: Sequence[NestedKey | Sequence[str]]) -> list[NestedKey]:
@@ -20,7 +20,7 @@ def _keys(keys: Sequence[NestedKey | Sequence[str]]) -> list[NestedKey]:
     return [key if isinstance(key, str) else tuple(key) for key in keys]
 
 
-class RewardTerm(Transform):
+class RewardTerm(SpecTransform):
     """Adds `weight * function(next[in_keys])` to the reward and writes the raw term beside it.
 
     Reads its in_keys from the next tensordict; writes `reward_terms/<name>` [N, 1] and adds to `reward_key`.

@@ -1,0 +1,77 @@
+"""What `train.py` does: check the config, show the stack, train, evaluate, render."""
+
+from __future__ import annotations
+
+import sys
+from datetime import datetime
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, open_dict
+from rich.console import Console
+
+from hdmi.build import ConfigError, describe, make_transforms
+from hdmi.learning.checkpoint import CheckpointError
+from hdmi.learning.trainer import DivergenceError, Trainer
+from hdmi.motion import MotionError
+
+# What a user can put right: shown as one line, without a traceback.
+USER_ERRORS = (ConfigError, MotionError, CheckpointError, DivergenceError, FileNotFoundError)
+
+
+def main(cfg: DictConfig) -> None:
+    """Runs one training from a config; leaves checkpoints, metrics.csv, eval.json and a video in its run folder."""
+    console = Console()
+    try:
+        folder = run_folder(cfg)
+        trainer = Trainer(cfg, folder)
+    except USER_ERRORS as error:
+        console.print(f"[red]{type(error).__name__}:[/red] {error}", highlight=False, soft_wrap=True)
+        sys.exit(2)
+    console.print(describe(make_transforms(cfg, trainer.task)))
+    console.print(
+        f"task {trainer.task.name}: {trainer.task.reference.num_frames} frames, {cfg.num_envs} environments, "
+        f"observations {trainer.sizes}, run folder {folder}",
+        soft_wrap=True,
+    )
+    try:
+        trainer.run()
+    except KeyboardInterrupt:
+        console.print(f"interrupted; continue with resume={folder}", soft_wrap=True)
+        sys.exit(130)
+    except DivergenceError as error:
+        console.print(f"[red]{type(error).__name__}:[/red] {error}", soft_wrap=True)
+        sys.exit(2)
+    finish(cfg, folder, console)
+
+
+def finish(cfg: DictConfig, folder: Path, console: Console) -> None:
+    """Evaluates the trained policy and renders it."""
+    from hdmi.evaluation import evaluate_checkpoint, render_checkpoint
+
+    result = evaluate_checkpoint(folder, num_envs=cfg.eval_envs)
+    console.print(result.table())
+    if cfg.video:
+        console.print(f"video: {render_checkpoint(folder)}", soft_wrap=True)
+
+
+def run_folder(cfg: DictConfig) -> Path:
+    """The folder of a new run, or the one to continue.
+
+    Raises:
+        CheckpointError: if `resume` names a folder without checkpoints.
+    """
+    if cfg.resume is not None:
+        path = Path(cfg.resume)
+        folder = path if path.is_dir() else path.parent.parent
+        return folder
+    name = cfg.run_name
+    if name is None:
+        label = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+        if HydraConfig.initialized():
+            ablation = HydraConfig.get().runtime.choices.get("ablation")
+            label += f"_{ablation}" if ablation else ""
+        name = f"{label}_seed{cfg.seed}"
+    with open_dict(cfg):
+        cfg.run_name = name
+    return Path(cfg.output_dir) / name

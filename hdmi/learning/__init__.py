@@ -1,0 +1,18 @@
+"""Networks, PPO, checkpoints and logs."""
+
+from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from hdmi.learning.networks import RunningNorm, make_actor, make_critic
+from hdmi.learning.policy import load_config, load_policy
+from hdmi.learning.trainer import Trainer
+
+__all__ = [
+    "CheckpointError",
+    "RunningNorm",
+    "Trainer",
+    "load_checkpoint",
+    "load_config",
+    "load_policy",
+    "make_actor",
+    "make_critic",
+    "save_checkpoint",
+]

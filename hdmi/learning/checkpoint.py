@@ -1,0 +1,82 @@
+"""Checkpoints: written atomically, rotated, read without unpickling code."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import torch
+
+FORMAT = 1
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint that cannot be used; the message names file and cause."""
+
+
+def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Writes a checkpoint; a crash or a full disk leaves what was there before.
+
+    Args:
+        state: tensors, numbers, strings and containers of them.
+
+    Raises:
+        OSError: if it cannot be written; the partial file is removed.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    try:
+        with partial.open("wb") as file:
+            torch.save({"format": FORMAT, **state}, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except (OSError, RuntimeError) as error:  # torch reports a full disk as RuntimeError
+        partial.unlink(missing_ok=True)
+        raise OSError(f"{path}: {error}") from error
+
+
+def rotate(folder: Path, keep: int) -> None:
+    """Removes all but the newest `keep` checkpoints of a run."""
+    for path in checkpoints(folder)[:-keep]:
+        path.unlink(missing_ok=True)
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """Checkpoints of a run folder, oldest first."""
+    return sorted(folder.glob("checkpoint_*.pt"))
+
+
+def find_checkpoint(path: str | Path) -> Path:
+    """A checkpoint file from itself or from the folder that holds it.
+
+    Raises:
+        CheckpointError: if there is none.
+    """
+    path = Path(path).expanduser()
+    if path.is_file():
+        return path
+    found = [*checkpoints(path), *checkpoints(path / "checkpoints")] if path.is_dir() else []
+    if not found and (path / "policy.pt").is_file():
+        return path / "policy.pt"
+    if not found:
+        raise CheckpointError(f"{path}: no checkpoint_*.pt or policy.pt there")
+    return found[-1]
+
+
+def load_checkpoint(path: str | Path, map_location: str | torch.device = "cpu") -> dict[str, Any]:
+    """Reads a checkpoint file or the newest of a run folder.
+
+    Raises:
+        CheckpointError: if there is none, or it is damaged, or not a checkpoint of this format.
+    """
+    file = find_checkpoint(path)
+    try:
+        state = torch.load(file, map_location=map_location, weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, ValueError, KeyError) as error:
+        raise CheckpointError(f"{file}: damaged or not a checkpoint: {error}") from error
+    if not isinstance(state, dict) or state.get("format") != FORMAT:
+        raise CheckpointError(f"{file}: not an hdmi checkpoint of format {FORMAT}")
+    return state

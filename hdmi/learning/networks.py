@@ -1,0 +1,110 @@
+"""Actor and critic: running normalisation of observations, then a multilayer perceptron."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
+
+_MIN_STD, _MAX_STD = 0.05, 2.0
+
+
+class RunningNorm(nn.Module):
+    """Normalises features by moments that `update` accumulates; gradients do not reach them.
+
+    Args:
+        size: features. clip: bound of the normalised values.
+    """
+
+    def __init__(self, size: int, clip: float = 10.0):
+        super().__init__()
+        self.clip = clip
+        self.mean: Tensor
+        self.var: Tensor
+        self.count: Tensor
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("var", torch.ones(size))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+
+    @torch.no_grad()
+    def update(self, values: Tensor) -> None:
+        """Adds a batch [..., size] to the moments (parallel-variance formula)."""
+        values = values.reshape(-1, values.shape[-1])
+        n = values.shape[0]
+        mean, var = values.mean(0), values.var(0, unbiased=False)
+        total = self.count + n
+        share = (n / total).to(mean.dtype)
+        delta = mean - self.mean
+        self.var.copy_((1 - share) * self.var + share * var + share * (1 - share) * delta.square())
+        self.mean.add_(delta * share)
+        self.count.copy_(total)
+
+    def forward(self, values: Tensor) -> Tensor:
+        return ((values - self.mean) / (self.var.sqrt() + 1e-2)).clamp(-self.clip, self.clip)
+
+
+class _Network(nn.Module):
+    """RunningNorm and an MLP, the MLP in bfloat16 if asked; output in float32."""
+
+    def __init__(self, in_size: int, out_size: int, hidden: Sequence[int], activation: str, bf16: bool, gain: float):
+        super().__init__()
+        if not hasattr(nn, activation):
+            raise ValueError(f"algo.activation: torch.nn has no {activation!r}")
+        self.norm = RunningNorm(in_size)
+        self.mlp = MLP(in_size, out_size, num_cells=list(hidden), activation_class=getattr(nn, activation))
+        self.bf16 = bf16
+        layers = [layer for layer in self.mlp if isinstance(layer, nn.Linear)]
+        for layer in layers:
+            nn.init.orthogonal_(layer.weight, gain if layer is layers[-1] else 2**0.5)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        normalised = self.norm(observation)
+        with torch.autocast(observation.device.type, dtype=torch.bfloat16, enabled=self.bf16):
+            out = self.mlp(normalised)
+        return out.float()
+
+
+class _GaussianHead(_Network):
+    """Mean from the network, standard deviation a free parameter per action."""
+
+    def __init__(self, in_size: int, out_size: int, init_noise: float, **kwargs):
+        super().__init__(in_size, out_size, gain=0.01, **kwargs)
+        self.log_std = nn.Parameter(torch.full((out_size,), init_noise).log())
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        loc = super().forward(observation)
+        return loc, self.log_std.exp().clamp(_MIN_STD, _MAX_STD).expand_as(loc)
+
+
+def make_actor(
+    in_size: int, out_size: int, hidden: Sequence[int], activation: str, init_noise: float, bf16: bool
+) -> ProbabilisticActor:
+    """Gaussian policy: `policy` [..., in_size] -> `action` [..., out_size] with `loc`, `scale`, `action_log_prob`."""
+    head = _GaussianHead(in_size, out_size, init_noise, hidden=hidden, activation=activation, bf16=bf16)
+    return ProbabilisticActor(
+        TensorDictModule(head, in_keys=["policy"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+
+
+def make_critic(in_size: int, hidden: Sequence[int], activation: str, bf16: bool) -> ValueOperator:
+    """State value from privileged observations: `critic` [..., in_size] -> `state_value` [..., 1]."""
+    return ValueOperator(_Network(in_size, 1, hidden, activation, bf16, gain=1.0), in_keys=["critic"])
+
+
+def observation_norm(module: nn.Module) -> RunningNorm:
+    """The normalisation of an actor or critic."""
+    return next(m for m in module.modules() if isinstance(m, RunningNorm))
+
+
+def use_bf16(setting: str | bool, device: torch.device) -> bool:
+    """Resolves `auto`: bfloat16 where the processor multiplies it natively."""
+    if setting != "auto":
+        return bool(setting)
+    return device.type == "cpu" and bool(torch.cpu.get_capabilities().get("avx512_bf16", False))

@@ -1,0 +1,59 @@
+"""Policies from checkpoints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torchrl.modules import ProbabilisticActor, ValueOperator
+
+from hdmi.learning.checkpoint import CheckpointError, find_checkpoint, load_checkpoint
+from hdmi.learning.networks import make_actor, make_critic, use_bf16
+
+
+def make_networks(
+    cfg: DictConfig, sizes: dict[str, int], device: torch.device
+) -> tuple[ProbabilisticActor, ValueOperator]:
+    """Actor and critic of a config. sizes: of `policy`, `critic` and `action`."""
+    algo = cfg.algo
+    bf16 = use_bf16(algo.bf16, device)
+    actor = make_actor(sizes["policy"], sizes["action"], algo.actor_hidden, algo.activation, algo.init_noise, bf16)
+    critic = make_critic(sizes["critic"], algo.critic_hidden, algo.activation, bf16)
+    return actor.to(device), critic.to(device)
+
+
+def load_config(path: str | Path) -> DictConfig:
+    """The config that a checkpoint was trained with.
+
+    Raises:
+        CheckpointError: if the checkpoint cannot be read.
+    """
+    cfg = OmegaConf.create(load_checkpoint(path)["config"])
+    assert isinstance(cfg, DictConfig)
+    return cfg
+
+
+def load_policy(
+    path: str | Path, device: str | torch.device = "cpu"
+) -> tuple[ProbabilisticActor, DictConfig, dict[str, Any]]:
+    """Reads a policy.
+
+    Returns:
+        The actor (`policy` -> `action`), its config, and the checkpoint's counters: iteration, frames.
+
+    Raises:
+        CheckpointError: if the checkpoint cannot be read or does not fit its own config.
+    """
+    device = torch.device(device)
+    file = find_checkpoint(path)
+    state = load_checkpoint(file, device)
+    cfg = OmegaConf.create(state["config"])
+    assert isinstance(cfg, DictConfig)
+    actor, _ = make_networks(cfg, state["sizes"], device)
+    try:
+        actor.load_state_dict(state["actor"])
+    except RuntimeError as error:
+        raise CheckpointError(f"{file}: the actor does not fit its config: {error}") from error
+    return actor.eval(), cfg, {"iteration": state["iteration"], "frames": state["frames"], "file": str(file)}

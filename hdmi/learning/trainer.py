@@ -1,0 +1,319 @@
+"""The training loop: collect with the policy, estimate advantages, update by PPO, log, checkpoint."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.utils import KLAdaptiveLR
+from torchrl.objectives.value import GAE
+
+from hdmi.build import Task, make_env, make_task, set_threads
+from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, rotate, save_checkpoint
+from hdmi.learning.logger import RunLogger
+from hdmi.learning.networks import observation_norm
+from hdmi.learning.policy import make_networks
+
+_WARMUP_STEPS = 8  # of the untrained policy, for first observation moments
+_MAX_BAD_UPDATES = 20  # minibatches without finite loss or gradient, in a row
+_LEARNER_KEYS = ("policy", "critic", "action", "action_log_prob", "advantage", "value_target", "state_value")
+
+
+class DivergenceError(RuntimeError):
+    """Training produced no finite updates any more."""
+
+
+class Trainer:
+    """PPO with an asymmetric critic, on one process.
+
+    Each iteration collects `frames_per_env` steps of `num_envs` environments, estimates advantages by GAE
+    (bootstrapping through truncations), makes `epochs` passes of minibatch updates, and then updates the observation
+    moments for the next collection. The actor's learning rate follows the policy's KL divergence.
+
+    Args:
+        cfg: the whole config.
+        folder: of the run; checkpoints, metrics.csv and config.yaml are written there.
+    """
+
+    def __init__(self, cfg: DictConfig, folder: Path):
+        self.cfg, self.folder = cfg, folder
+        self.device = torch.device(cfg.device)
+        set_threads(cfg.num_threads)
+        torch.manual_seed(cfg.seed)
+        self.task: Task = make_task(cfg)
+        self.env: TransformedEnv = make_env(cfg, task=self.task)
+        self.env.set_seed(cfg.seed)
+        spec = self.env.full_observation_spec
+        self.sizes = {
+            "policy": spec["policy"].shape[-1],
+            "critic": spec["critic"].shape[-1],
+            "action": self.env.action_spec.shape[-1],
+        }
+        self.actor, self.critic = make_networks(cfg, self.sizes, self.device)
+        algo = cfg.algo
+        self.loss = ClipPPOLoss(
+            self.actor,
+            self.critic,
+            clip_epsilon=algo.clip,
+            entropy_coeff=algo.entropy,
+            critic_coeff=1.0,
+            loss_critic_type="smooth_l1",
+            normalize_advantage=False,
+        )
+        self.gae = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=self.critic, average_gae=False)
+        self.actor_optim = torch.optim.Adam(self.actor.parameters(), lr=algo.actor_lr, fused=True)
+        self.critic_optim = torch.optim.Adam(self.critic.parameters(), lr=algo.critic_lr, fused=True)
+        self.schedule = KLAdaptiveLR(
+            self.actor_optim, target_kl=algo.desired_kl, factor=1.2, min_lr=1e-5, max_lr=algo.max_lr
+        )
+        self.frames_per_batch = cfg.num_envs * algo.frames_per_env
+        self.iteration = self.frames = 0
+        self.bad_updates = self.lost_checkpoints = 0
+        self.elapsed = 0.0  # s of collection and learning
+        self._warm_up()
+        self.collector = Collector(
+            self.env,
+            self.actor,
+            frames_per_batch=self.frames_per_batch,
+            total_frames=-1,
+            trust_policy=True,
+            return_same_td=True,
+            track_traj_ids=False,
+        )
+        if cfg.resume is not None:
+            self.restore(load_checkpoint(cfg.resume, self.device))
+
+    # -- one iteration ----------------------------------------------------------------------------------------
+
+    def _warm_up(self) -> None:
+        with torch.no_grad():
+            batch = self.env.rollout(_WARMUP_STEPS, self.actor, break_when_any_done=False)
+        self._update_moments(batch)
+
+    def _update_moments(self, batch: TensorDictBase) -> None:
+        observation_norm(self.actor).update(batch["policy"])
+        observation_norm(self.critic).update(batch["critic"])
+
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """One PPO update on a batch [N, T]; returns losses and statistics."""
+        algo = self.cfg.algo
+        with torch.no_grad():
+            self.gae(batch)
+        data = batch.select(*_LEARNER_KEYS).reshape(-1)
+        advantage = data["advantage"]
+        data["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
+        size = data.shape[0] // algo.minibatches
+        sums: dict[str, float] = {}
+        count = 0
+        for _ in range(algo.epochs):
+            order = torch.randperm(data.shape[0], device=data.device)
+            for m in range(algo.minibatches):
+                losses = self._step(data[order[m * size : (m + 1) * size]])
+                if losses is None:
+                    continue
+                count += 1
+                for key, value in losses.items():
+                    sums[key] = sums.get(key, 0.0) + value
+        self._update_moments(batch)
+        stats = {key: value / max(count, 1) for key, value in sums.items()}
+        target, error = data["value_target"], data["value_target"] - data["state_value"]
+        stats["explained_variance"] = float(1 - error.var() / (target.var() + 1e-8))
+        stats["actor_lr"] = self.actor_optim.param_groups[0]["lr"]
+        stats["noise_std"] = float(batch["scale"].mean())
+        return stats
+
+    def _step(self, minibatch: TensorDictBase) -> dict[str, float] | None:
+        """One gradient step; None, without touching the weights, if loss or gradient is not finite."""
+        losses = self.loss(minibatch)
+        total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+        self.actor_optim.zero_grad()
+        self.critic_optim.zero_grad()
+        total.backward()
+        norm = self.cfg.algo.max_grad_norm
+        actor_norm = torch.nn.utils.clip_grad_norm_(self.actor.parameters(), norm)
+        critic_norm = torch.nn.utils.clip_grad_norm_(self.critic.parameters(), norm)
+        if not (total.isfinite() and actor_norm.isfinite() and critic_norm.isfinite()):
+            self.bad_updates += 1
+            if self.bad_updates >= _MAX_BAD_UPDATES:
+                raise DivergenceError(
+                    f"iteration {self.iteration}: {self.bad_updates} updates in a row without finite loss or gradient "
+                    f"(loss {total.item()}); resume from an earlier checkpoint with a smaller algo.actor_lr or "
+                    "algo.critic_lr"
+                )
+            return None
+        self.bad_updates = 0
+        self.actor_optim.step()
+        self.critic_optim.step()
+        kl = float(losses["kl_approx"])
+        self.schedule.step(kl)
+        return {
+            "loss_actor": float(losses["loss_objective"]),
+            "loss_critic": float(losses["loss_critic"]),
+            "entropy": float(losses["entropy"]),
+            "clip_fraction": float(losses["clip_fraction"]),
+            "kl": kl,
+            "grad_norm_actor": float(actor_norm),
+        }
+
+    # -- the loop ---------------------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Trains up to `cfg.total_frames`; an interrupt leaves a checkpoint to resume from.
+
+        Raises:
+            DivergenceError: if updates stay without finite loss.
+            KeyboardInterrupt: after saving.
+        """
+        cfg = self.cfg
+        self.folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(cfg, self.folder / "config.yaml")
+        logger = RunLogger(self.folder, cfg, self.iteration)
+        batches = iter(self.collector)
+        columns = (
+            TextColumn("[bold]{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+            TextColumn("{task.fields[numbers]}"),
+        )  # fmt: skip
+        try:
+            with Progress(*columns, refresh_per_second=2) as progress:
+                total = -(-cfg.total_frames // self.frames_per_batch)
+                bar = progress.add_task(self.task.name, total=total, completed=self.iteration, numbers="")
+                while self.frames < cfg.total_frames:
+                    start = time.perf_counter()
+                    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+                        batch = next(batches)
+                    collected = time.perf_counter()
+                    row = {**summarize(batch), **self.update(batch)}
+                    end = time.perf_counter()
+                    self.elapsed += end - start
+                    self.iteration += 1
+                    self.frames += self.frames_per_batch
+                    row |= {
+                        "frames": self.frames,
+                        "minutes": self.elapsed / 60,
+                        "collect_sps": self.frames_per_batch / (collected - start),
+                        "learn_sps": self.frames_per_batch / (end - collected),
+                        "train_sps": self.frames_per_batch / (end - start),
+                        "diverged_worlds": self.env.base_env.num_diverged,
+                    }
+                    if cfg.eval_interval and self.iteration % cfg.eval_interval == 0:
+                        row |= self._evaluate()
+                    logger.log(self.iteration, row)
+                    progress.update(bar, completed=self.iteration, numbers=_headline(row))
+                    if not progress.console.is_terminal and self.iteration % 10 == 0:
+                        progress.console.print(f"{self.iteration}/{total} {_headline(row)}", highlight=False)
+                    if self.iteration % cfg.checkpoint_interval == 0:
+                        self.save()
+        finally:
+            if self.frames:
+                self.save()
+            logger.close()
+            self.collector.shutdown()
+
+    def _evaluate(self) -> dict[str, float]:
+        from hdmi.evaluation import evaluate_policy  # evaluation depends on learning, not the other way round
+
+        with torch.random.fork_rng():
+            result = evaluate_policy(self.actor, self.cfg, self.cfg.eval_envs, task=self.task)
+        return {f"eval/{k}": v["mean"] for k, v in result.items() if isinstance(v, dict) and "mean" in v}
+
+    # -- checkpoints ------------------------------------------------------------------------------------------
+
+    def save(self) -> None:
+        """Writes a checkpoint that resuming continues exactly from; a full disk is reported and counted."""
+        # The collector has no public access to the tensordict that it carries from batch to batch.
+        carrier = self.collector._carrier
+        state = {
+            "config": OmegaConf.to_container(self.cfg, resolve=True),
+            "task": self.task.name,
+            "sizes": self.sizes,
+            "iteration": self.iteration,
+            "frames": self.frames,
+            "elapsed": self.elapsed,
+            "actor": self.actor.state_dict(),
+            "critic": self.critic.state_dict(),
+            "actor_optim": self.actor_optim.state_dict(),
+            "critic_optim": self.critic_optim.state_dict(),
+            "rng": torch.get_rng_state(),
+            "env": self.env.base_env.get_state().to_dict(),
+            "num_diverged": self.env.base_env.num_diverged,
+            "transforms": dict(self.env.transform.state_dict()),
+            "carrier": carrier.to_dict(),
+        }
+        path = self.folder / "checkpoints" / f"checkpoint_{self.iteration:06d}.pt"
+        try:
+            save_checkpoint(path, state)
+            rotate(path.parent, self.cfg.keep_checkpoints)
+        except OSError as error:
+            self.lost_checkpoints += 1
+            print(f"checkpoint not written, the previous one stays: {error}", file=sys.stderr)
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continues from what `save` wrote.
+
+        Raises:
+            CheckpointError: for a checkpoint of another task, or of other sizes of observations or actions.
+        """
+        if state["task"] != self.task.name:
+            raise CheckpointError(
+                f"resume: a checkpoint of task {state['task']!r}, but the config says {self.task.name!r}"
+            )
+        if state["sizes"] != self.sizes:
+            raise CheckpointError(f"resume: the checkpoint has sizes {state['sizes']}, the config {self.sizes}")
+        self.actor.load_state_dict(state["actor"])
+        self.critic.load_state_dict(state["critic"])
+        self.actor_optim.load_state_dict(state["actor_optim"])
+        self.critic_optim.load_state_dict(state["critic_optim"])
+        self.iteration, self.frames, self.elapsed = state["iteration"], state["frames"], state["elapsed"]
+        carrier = TensorDict(state["carrier"], batch_size=[len(state["carrier"]["done"])])
+        if carrier.batch_size[0] != self.cfg.num_envs:
+            raise CheckpointError(
+                f"resume: the checkpoint has {carrier.batch_size[0]} environments, the config num_envs={self.cfg.num_envs}"
+            )
+        self.env.base_env.set_state(TensorDict(state["env"]))
+        self.env.base_env.num_diverged = state["num_diverged"]
+        self.env.transform.load_state_dict(state["transforms"])
+        self.collector._carrier = carrier.to(self.device)
+        torch.set_rng_state(state["rng"].cpu())
+
+
+def summarize(batch: TensorDictBase) -> dict[str, float]:
+    """Figures of a batch [N, T]: rewards by term, tracking errors, causes of termination, episodes that ended."""
+    after = batch["next"]
+    done = after["done"]
+    ended = max(int(done.sum()), 1)
+    row = {"reward": float(after["reward"].mean())}
+    for name, value in after["reward_terms"].items():
+        row[f"reward/{name}"] = float(value.mean())
+    metrics = after.get("metrics", None)
+    if metrics is not None:
+        means = {name: float(value.mean()) for name, value in metrics.items()}
+        if "contact_made" in means:
+            row["contact_rate"] = means.pop("contact_made") / max(means.pop("contact_intended"), 1e-6)
+        row |= means
+    for name, value in after["termination"].items():
+        row[f"termination/{name}"] = float((value & done).sum()) / ended
+    row["episode_completed"] = float(after["completed"].sum()) / ended
+    row["episodes"] = int(done.sum())
+    if done.any():
+        row["episode_return"] = float(after["episode_reward"][done].mean())
+        row["episode_steps"] = float(after["step_count"][done].float().mean())
+    return row
+
+
+def _headline(row: dict[str, float]) -> str:
+    parts = [f"reward {row['reward']:.3f}", f"steps {row.get('episode_steps', 0):.0f}"]
+    parts.append(f"completed {row['episode_completed']:.0%}")
+    if "contact_rate" in row:
+        parts.append(f"contact {row['contact_rate']:.0%}")
+    if "eval/success_rate" in row:
+        parts.append(f"success {row['eval/success_rate']:.0%}")
+    return "  ".join([*parts, f"{row['frames'] / 1e6:.2f}M frames", f"{row['train_sps']:.0f} steps/s"])
