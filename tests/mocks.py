@@ -13,7 +13,6 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
-from torchrl.envs.utils import step_mdp
 
 from hdmi.build import Task, make_task
 from hdmi.transforms.common import spec_like
@@ -176,7 +175,7 @@ def drive(
     for t in range(steps):
         tensordict.set(env.action_key, action_of(t, shape) if actions is None else actions(t))
         out.append(env.step(tensordict))
-        tensordict = step_mdp(out[-1])
+        tensordict = env.step_mdp(out[-1])
     return out
 
 

@@ -30,8 +30,8 @@ class PhysicsBackend(Protocol):
         """A field of MjModel with one value per world, writable; follow writes with `commit_model`. [N, ...]"""
         ...
 
-    def step(self, nstep: int) -> None:
-        """Advances every world by `nstep` physics steps under its `ctrl`."""
+    def step(self, controls: Tensor) -> None:
+        """Advances every world by S physics steps, each under its own controls. [N, S, num_actuators]"""
         ...
 
     def reset(self, mask: Tensor) -> None:
@@ -91,9 +91,18 @@ class BatchBackend:
             self._model[field] = torch.from_numpy(self._batch.expand(field))
         return self._model[field]
 
-    def step(self, nstep: int) -> None:
+    def step(self, controls: Tensor) -> None:
+        # One call for all but the last step: every call waits for its slowest world.
+        if controls.shape[1] > 1:
+            self._batch.rollout(
+                controls.shape[1] - 1,
+                control=controls[:, :-1].double().contiguous().numpy(),
+                control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
+                record=(),
+            )
+        self.data("ctrl").copy_(controls[:, -1])
         # VEL: positions and velocities of the new state; contact and actuator forces of the last physics step
-        self._batch.step(nstep=nstep, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self._batch.step(stage=mujoco.mjtStage.mjSTAGE_VEL)
 
     def reset(self, mask: Tensor) -> None:
         self._batch.reset(_ids(mask), stage=mujoco.mjtStage.mjSTAGE_NONE)

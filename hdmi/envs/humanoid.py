@@ -132,10 +132,7 @@ class HumanoidObjectEnv(EnvBase):
         push = tensordict.get("push", None)
         if push is not None:
             self._push(push)
-        ctrl = self.backend.data("ctrl")
-        for s in range(count):
-            ctrl.copy_(targets[:, s])
-            self.backend.step(decimation // count)
+        self.backend.step(targets.repeat_interleave(decimation // count, dim=1))
         failed = self.backend.failed()
         if failed.any():
             self.num_diverged += int(failed.sum())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hdmi.functional.rotation import quat_apply_inverse, quat_conjugate, quat_multiply, yaw_quat
+from hdmi.functional.rotation import yaw_quat
 
 
 def local_pose(
@@ -22,10 +22,22 @@ def local_pose(
     Returns:
         Positions [..., K, 3] and orientations [..., K, 4] in that frame.
     """
-    heading = yaw_quat(root_quat_w).unsqueeze(-2)  # [..., 1, 4]
-    ground = torch.cat([root_pos_w[..., :2], torch.zeros_like(root_pos_w[..., 2:])], dim=-1).unsqueeze(-2)
-    pos = quat_apply_inverse(heading, body_pos_w - ground)
-    quat = quat_multiply(quat_conjugate(heading).expand_as(body_quat_w), body_quat_w)
+    # The frame is turned about z only, which leaves a plane rotation and half of the quaternion product.
+    cos_half, _, _, sin_half = yaw_quat(root_quat_w).unsqueeze(-2).unbind(-1)  # [..., 1]
+    cos, sin = cos_half.square() - sin_half.square(), 2 * cos_half * sin_half
+    x, y, height = body_pos_w.unbind(-1)
+    x, y = x - root_pos_w[..., :1], y - root_pos_w[..., 1:2]
+    pos = torch.stack([cos * x + sin * y, cos * y - sin * x, height], dim=-1)
+    qw, qx, qy, qz = body_quat_w.unbind(-1)
+    quat = torch.stack(
+        [
+            cos_half * qw + sin_half * qz,
+            cos_half * qx + sin_half * qy,
+            cos_half * qy - sin_half * qx,
+            cos_half * qz - sin_half * qw,
+        ],
+        dim=-1,
+    )
     return pos, quat
 
 

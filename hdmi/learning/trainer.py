@@ -156,8 +156,8 @@ class Trainer:
         kl = float(losses["kl_approx"])
         self.schedule.step(kl)
         return {
-            "loss_actor": float(losses["loss_objective"]),
-            "loss_critic": float(losses["loss_critic"]),
+            "loss_actor": float(losses["loss_objective"].detach()),
+            "loss_critic": float(losses["loss_critic"].detach()),
             "entropy": float(losses["entropy"]),
             "clip_fraction": float(losses["clip_fraction"]),
             "kl": kl,

@@ -1,0 +1,410 @@
+"""The evaluation protocol of the paper: first episodes from the first frame over the whole motion, deterministic."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, open_dict
+from rich.table import Table
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
+
+from hdmi.build import ConfigError, Task, make_env, make_task
+from hdmi.learning.checkpoint import CheckpointError
+from hdmi.learning.policy import load_policy
+from hdmi.motion import Reference
+from hdmi.transforms import ReferenceStateInitialization
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
+
+# Metrics that every eval.json names, null where the task has nothing to measure.
+METRICS = (
+    "joint_error",
+    "body_error",
+    "root_pos_error",
+    "root_ori_error",
+    "object_pos_error",
+    "object_ori_error",
+)
+UNITS = {
+    "success_rate": "%",
+    "survival": "%",
+    "contact_rate": "%",
+    "joint_error": "rad",
+    "body_error": "m",
+    "root_pos_error": "m",
+    "root_ori_error": "rad",
+    "object_pos_error": "m",
+    "object_ori_error": "rad",
+}
+_MADE, _INTENDED = "contact_made", "contact_intended"
+_NOT_TERMINATIONS = ("motion_end", "step_count")  # in the group, but no failures
+_DIVERGED, _OTHER = "diverged", "other"
+
+
+class StartAtFrame(ReferenceStateInitialization):
+    """Starts all episodes from one frame of the reference, perturbed.
+
+    Args:
+        frame: of the reference. noise: as in `ReferenceStateInitialization`.
+    """
+
+    def __init__(
+        self, reference: Reference, frame: int, noise: Mapping[str, float | Sequence[float]] | None = None
+    ) -> None:
+        super().__init__(reference, "first", 1, noise)
+        if not 0 <= frame < reference.num_frames - 1:
+            raise ValueError(f"start: expected a frame from 0 to {reference.num_frames - 2}, got {frame}")
+        self.frame = frame
+
+    def sample_frames(self, batch_size: torch.Size, device: torch.device | None) -> Tensor:
+        return torch.full(tuple(batch_size), self.frame, dtype=torch.int64, device=device)
+
+
+def evaluation_config(
+    cfg: DictConfig, terminations: Sequence[str] | None = None, start: int = 0, motion_root: str | None = None
+) -> DictConfig:
+    """The training config changed to the protocol; reset noise, randomization and observation noise stay.
+
+    Args:
+        terminations: names of the terminations that end episodes; None for those of the training.
+        start: frame of the reference that episodes start from.
+        motion_root: instead of the config's.
+
+    Raises:
+        ConfigError: for a termination that the config does not have.
+    """
+    cfg = copy.deepcopy(cfg)
+    with open_dict(cfg):
+        node = (cfg.reset or {}).get("state") or {}
+        cls: type = StartAtFrame if start else ReferenceStateInitialization
+        kept = {key: value for key, value in node.items() if key in inspect.signature(cls).parameters}
+        where = {"frame": start} if start else {"start": "first"}
+        state = kept | where | {"_target_": f"{cls.__module__}.{cls.__qualname__}"}
+        cfg.reset = {**(cfg.reset or {}), "state": state}
+        known = termination_names(cfg)
+        if terminations is not None:
+            if unknown := [name for name in terminations if name not in known]:
+                raise ConfigError(f"terminations: the config has no {unknown}; there is {known}")
+            for name in known:
+                if name not in terminations:
+                    cfg.termination[name] = None
+        if motion_root is not None:
+            cfg.motion_root = motion_root
+    return cfg
+
+
+def termination_names(cfg: DictConfig) -> list[str]:
+    """Nodes of a config that end episodes as failures."""
+    nodes = cfg.termination or {}
+    return [str(name) for name, node in nodes.items() if node is not None and name not in _NOT_TERMINATIONS]
+
+
+def make_evaluation_env(cfg: DictConfig, task: Task, num_envs: int) -> TransformedEnv:
+    """The environment of an `evaluation_config`; no step limit below the motion's length."""
+    step_count = (cfg.termination or {}).get("step_count")
+    if step_count is not None:
+        cfg = copy.deepcopy(cfg)
+        frames = task.reference.num_frames
+        cfg.termination.step_count.max_steps = max(step_count.get("max_steps") or frames, frames)
+    return make_env(cfg, num_envs, task)
+
+
+class EvalResult(Mapping[str, Any]):
+    """What eval.json holds, as a mapping.
+
+    Figures are `{"mean", "std"}` over environments, or None where nothing could be measured.
+    """
+
+    def __init__(self, values: Mapping[str, Any], path: Path | None = None):
+        self._values = dict(values)
+        self.path = path  # where it was written
+
+    def __getitem__(self, key: str) -> Any:
+        return self._values[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __repr__(self) -> str:
+        return f"EvalResult({self._values})"
+
+    @classmethod
+    def load(cls, path: str | Path) -> EvalResult:
+        """Reads an eval.json."""
+        return cls(json.loads(Path(path).read_text(encoding="utf-8")), Path(path))
+
+    def save(self, path: str | Path) -> None:
+        """Writes an eval.json; a crash or a full disk leaves what was there before."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_suffix(".partial")
+        try:
+            partial.write_text(json.dumps(self._values, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+            os.replace(partial, path)
+        except OSError:
+            partial.unlink(missing_ok=True)
+            raise
+        self.path = path
+
+    def figures(self) -> dict[str, dict[str, float]]:
+        """The entries that have a mean and a standard deviation."""
+        return {key: value for key, value in self.items() if isinstance(value, dict) and "mean" in value}
+
+    def table(self) -> Table:
+        """The figures with units, and why episodes failed."""
+        title = f"{self['task']}: {self['num_envs']} episodes of {self['motion_frames'] - 1} steps"
+        table = Table(title=title, title_justify="left")
+        table.add_column("metric")
+        for column in ("mean", "std"):
+            table.add_column(column, justify="right")
+        table.add_column("unit")
+        for name, value in self.figures().items():
+            unit = UNITS.get(name, "")
+            shown = (
+                f"{value[key] * 100:.1f}" if unit == "%" else f"{value[key]:.3g}" for key in ("mean", "std")
+            )  # fmt: skip
+            table.add_row(name, *shown, unit)
+        table.add_section()
+        for name, share in self["termination_causes"].items():
+            frame = self["failure_frames"][name]
+            table.add_row(
+                f"failed by {name}", f"{share * 100:.1f}", "", "%" if frame is None else f"%, frame {frame:g}"
+            )
+        return table
+
+
+class FirstEpisodes:
+    """Accumulates the figures of the first episode of every environment.
+
+    An environment counts up to and including the step that terminates it; a step whose physics diverged has no state
+    of its own and only ends the episode.
+
+    Args:
+        num_envs: environments. horizon: steps of a full episode. causes: termination names, the first has precedence.
+    """
+
+    def __init__(self, num_envs: int, horizon: int, causes: Sequence[str] = ()):
+        self.horizon = horizon
+        self.causes = (_DIVERGED, *causes, _OTHER)
+        self.alive = torch.ones(num_envs, dtype=torch.bool)
+        self.survived = torch.zeros(num_envs, dtype=torch.int64)  # steps without termination
+        self.steps = 0
+        self._counted = torch.zeros(num_envs, dtype=torch.int64)
+        self._sums: dict[str, Tensor] = {}
+        self._ended = {cause: torch.zeros(num_envs, dtype=torch.bool) for cause in self.causes}
+
+    def add(self, after: TensorDictBase) -> None:
+        """Takes the `next` of a step of all environments, without resets in between. [N]"""
+        self.steps += 1
+        terminated = after["terminated"].reshape(-1).cpu()
+        diverged = _flag(after.get("diverged", None), terminated)
+        measured = self.alive & ~diverged
+        metrics = after.get("metrics", None)
+        for name, value in () if metrics is None else metrics.items():
+            value = value.reshape(-1).double().cpu()
+            total = self._sums.setdefault(name, torch.zeros_like(value))
+            total += torch.where(measured, value, 0)
+        self._counted += measured
+
+        unexplained = self.alive & (terminated | diverged)
+        self.alive &= ~unexplained
+        self.survived += self.alive
+        flags = after.get("termination", None)
+        for cause in self.causes:
+            if cause == _DIVERGED:
+                fired = diverged
+            elif cause == _OTHER:
+                fired = unexplained
+            else:
+                fired = _flag(None if flags is None else flags.get(cause, None), terminated)
+            self._ended[cause] |= unexplained & fired
+            unexplained = unexplained & ~fired
+
+    @property
+    def success(self) -> Tensor:
+        """Environments that came through the whole horizon without termination. bool [N]"""
+        return self.survived >= self.horizon
+
+    def values(self) -> dict[str, Tensor]:
+        """Figures of each environment, NaN where nothing could be measured. [N]"""
+        out = {"success_rate": self.success.double(), "survival": self.survived.double() / self.horizon}
+        out |= {name: total / self._counted for name, total in self._sums.items() if name not in (_MADE, _INTENDED)}
+        if _MADE in self._sums:
+            out["contact_rate"] = self._sums[_MADE] / self._sums[_INTENDED]
+        return out
+
+    def summary(self) -> dict[str, Any]:
+        """Mean and standard deviation over environments, and why and when episodes failed."""
+        values = self.values()
+        names = ["success_rate", "survival", *METRICS, "contact_rate"]
+        names += [name for name in values if name not in names]
+        ended = {cause: mask for cause, mask in self._ended.items() if cause != _OTHER or mask.any()}
+        return {name: _statistic(values.get(name)) for name in names} | {
+            "termination_causes": {cause: float(mask.double().mean()) for cause, mask in ended.items()},
+            # the frame of the first step that was not survived
+            "failure_frames": {
+                cause: float(self.survived[mask].double().quantile(0.5)) + 1 if mask.any() else None
+                for cause, mask in ended.items()
+            },
+        }
+
+
+def _flag(value: Tensor | None, like: Tensor) -> Tensor:
+    return torch.zeros_like(like) if value is None else value.reshape(-1).cpu()
+
+
+def _statistic(values: Tensor | None) -> dict[str, float] | None:
+    if values is None or not (finite := values[values.isfinite()]).numel():
+        return None
+    return {"mean": float(finite.mean()), "std": float(finite.std(correction=0))}
+
+
+def on_device(actor: torch.nn.Module, device: torch.device | None) -> Policy:
+    """A policy that acts on tensordicts of another device than its parameters'."""
+    home = next((p.device for p in actor.parameters()), None)
+    if home is None or home == device:
+        return actor
+
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        out = actor(tensordict.select("policy").to(home))
+        return tensordict.set("action", out["action"].to(device))
+
+    return act
+
+
+@torch.no_grad()
+def run_episodes(env: TransformedEnv, policy: Policy, horizon: int, causes: Sequence[str] = ()) -> FirstEpisodes:
+    """Plays one episode in every environment, without resets in between, until all have ended."""
+    episodes = FirstEpisodes(env.batch_size[0], horizon, causes)
+    tensordict = env.reset()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        for _ in range(horizon):
+            stepped = env.step(policy(tensordict))
+            episodes.add(stepped["next"])
+            if not episodes.alive.any():
+                break
+            tensordict = env.step_mdp(stepped)
+    return episodes
+
+
+def evaluate_policy(
+    actor: torch.nn.Module,
+    cfg: DictConfig,
+    num_envs: int,
+    task: Task | None = None,
+    terminations: Sequence[str] | None = None,
+    seed: int = 0,
+) -> EvalResult:
+    """Evaluates an actor under the conditions it was trained with.
+
+    Episodes start at the first frame and run over the whole motion; the first of each environment counts. Actions are
+    the policy's means. An episode succeeds if it reaches the last frame without termination or divergence.
+
+    Args:
+        actor: `policy` -> `action`.
+        cfg: of the training.
+        task: made from the config if absent.
+        terminations: names of those that end episodes; None for those of the training, empty for none.
+        seed: of start states, randomization and noise. The caller's random state is left alone.
+
+    Raises:
+        ConfigError: for a termination that the config does not have, or a config that cannot be built.
+    """
+    cfg = evaluation_config(cfg, terminations)
+    task = make_task(cfg) if task is None else task
+    causes = termination_names(cfg)
+    horizon = task.reference.num_frames - 1
+    was_training = actor.training
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        env = make_evaluation_env(cfg, task, num_envs)
+        try:
+            actor.eval()
+            episodes = run_episodes(env, on_device(actor, env.device), horizon, causes)
+        finally:
+            actor.train(was_training)
+            env.close()
+    return EvalResult(
+        episodes.summary()
+        | {
+            "task": task.name,
+            "motion": task.reference.name,
+            "motion_frames": task.reference.num_frames,
+            "num_envs": num_envs,
+            "terminations": causes,
+            "seed": seed,
+        }
+    )
+
+
+def evaluate_checkpoint(
+    run_or_checkpoint: str | Path,
+    num_envs: int = 256,
+    terminations: Sequence[str] | None = None,
+    seed: int = 0,
+    out: str | Path | None = None,
+    task: str | None = None,
+    motion_root: str | None = None,
+    num_threads: int | None = None,
+) -> EvalResult:
+    """Evaluates a checkpoint by `evaluate_policy` and writes eval.json.
+
+    Args:
+        run_or_checkpoint: a run folder (its newest checkpoint counts) or a checkpoint file.
+        out: file to write; None for eval.json in the run folder.
+        task: that the checkpoint must be of.
+        motion_root, num_threads: instead of the training's.
+
+    Raises:
+        CheckpointError: if there is no usable checkpoint, or it is of another task.
+        ConfigError, MotionError: if its environment cannot be built here.
+        OSError: if the result cannot be written.
+    """
+    actor, cfg, info = load_checked_policy(run_or_checkpoint, task)
+    if motion_root is not None:
+        cfg.motion_root = motion_root
+    if num_threads is not None:
+        cfg.num_threads = num_threads
+    values = evaluate_policy(actor, cfg, num_envs, terminations=terminations, seed=seed)
+    file = Path(info["file"])
+    folder = run_folder_of(file)
+    origin = {
+        "checkpoint": str(file.relative_to(folder)),
+        "iteration": info["iteration"],
+        "frames": info["frames"],
+    }
+    result = EvalResult({**values, **origin})
+    result.save(folder / "eval.json" if out is None else out)
+    return result
+
+
+def load_checked_policy(
+    path: str | Path, task: str | None = None
+) -> tuple[torch.nn.Module, DictConfig, dict[str, Any]]:
+    """`load_policy`, but only of the given task if there is one.
+
+    Raises:
+        CheckpointError: if there is no usable checkpoint, or it is of another task.
+    """
+    actor, cfg, info = load_policy(path)
+    if task is not None and cfg.task.name != task:
+        raise CheckpointError(f"{info['file']}: a policy of task {cfg.task.name!r}, not of {task!r}")
+    return actor, cfg, info
+
+
+def run_folder_of(checkpoint: Path) -> Path:
+    """The run folder that a checkpoint file belongs to."""
+    folder = checkpoint.parent
+    return folder.parent if folder.name == "checkpoints" else folder
