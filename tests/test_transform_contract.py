@@ -290,7 +290,8 @@ def upper() -> list[Transform]:
         T.History(X, 2),
         T.LostContact(min_force=2.0, min_steps=2),
         T.InteractionReward(),
-        T.ActionHistory(2, 4, action_key="action"),
+        T.JointPositionAction({".*": 1.0}, JOINTS),
+        T.ActionHistory(2, 4),
     ]
 
 

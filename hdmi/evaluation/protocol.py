@@ -69,15 +69,12 @@ class StartAtFrame(ReferenceStateInitialization):
         return torch.full(tuple(batch_size), self.frame, dtype=torch.int64, device=device)
 
 
-def evaluation_config(
-    cfg: DictConfig, terminations: Sequence[str] | None = None, start: int = 0, motion_root: str | None = None
-) -> DictConfig:
+def evaluation_config(cfg: DictConfig, terminations: Sequence[str] | None = None, start: int = 0) -> DictConfig:
     """The training config changed to the protocol; reset noise, randomization and observation noise stay.
 
     Args:
         terminations: names of the terminations that end episodes; None for those of the training.
         start: frame of the reference that episodes start from.
-        motion_root: instead of the config's.
 
     Raises:
         ConfigError: for a termination that the config does not have.
@@ -97,8 +94,6 @@ def evaluation_config(
             for name in known:
                 if name not in terminations:
                     cfg.termination[name] = None
-        if motion_root is not None:
-            cfg.motion_root = motion_root
     return cfg
 
 
@@ -179,9 +174,8 @@ class EvalResult(Mapping[str, Any]):
         table.add_section()
         for name, share in self["termination_causes"].items():
             frame = self["failure_frames"][name]
-            table.add_row(
-                f"failed by {name}", f"{share * 100:.1f}", "", "%" if frame is None else f"%, frame {frame:g}"
-            )
+            when = "" if frame is None else f", median frame {frame:g}"
+            table.add_row(f"failed by {name}", f"{share * 100:.1f}", "", f"%{when}")
         return table
 
 

@@ -144,6 +144,8 @@ class ReferenceStateInitialization(SpecTransform):
         margin: frames at the end that no episode starts from.
         noise: half ranges of uniform perturbations: root_pos [3] m, root_rpy [3] rad, root_lin_vel, root_ang_vel,
             joint_pos (rad), joint_vel; object_pos [3], object_rpy [3], object_joint (rad). Absent means none.
+        held_noise: factor of the object's perturbations at frames where contact is intended: an object between two
+            hands cannot be somewhere else.
     """
 
     _NOISES = (
@@ -157,6 +159,7 @@ class ReferenceStateInitialization(SpecTransform):
         start: Literal["uniform", "first"] = "uniform",
         margin: int = 1,
         noise: Mapping[str, float | Sequence[float]] | None = None,
+        held_noise: float = 1.0,
     ):
         super().__init__()
         if start not in ("uniform", "first"):
@@ -167,6 +170,8 @@ class ReferenceStateInitialization(SpecTransform):
         self.start = start
         self.num_starts = max(reference.num_frames - margin, 1)
         self.reference = reference
+        held = reference.contact.any(-1, keepdim=True)  # [T, 1]
+        self.register_buffer("object_noise", torch.where(held, held_noise, 1.0), persistent=False)
         for name in self._NOISES:
             value = torch.as_tensor((noise or {}).get(name, 0.0), dtype=torch.float32)
             self.register_buffer(f"noise_{name}", value, persistent=False)
@@ -206,16 +211,16 @@ class ReferenceStateInitialization(SpecTransform):
             "joint_vel": joint_vel + noise("joint_vel", joint_vel),
         }
         if ref.has_object:
-            pos, quat = ref.object_pos[frames], ref.object_quat[frames]
+            pos, quat, share = ref.object_pos[frames], ref.object_quat[frames], self.object_noise[frames]
             state |= {
-                "object_pos": pos + noise("object_pos", pos),
-                "object_quat": quat_multiply(quat, quat_from_euler(noise("object_rpy", pos))),
+                "object_pos": pos + share * noise("object_pos", pos),
+                "object_quat": quat_multiply(quat, quat_from_euler(share * noise("object_rpy", pos))),
                 "object_lin_vel": ref.object_lin_vel[frames],
                 "object_ang_vel": ref.object_ang_vel[frames],
             }
             if ref.object_joint_pos.shape[-1]:
                 joint = ref.object_joint_pos[frames]
-                state["object_joint_pos"] = joint + noise("object_joint", joint)
+                state["object_joint_pos"] = joint + share * noise("object_joint", joint)
                 state["object_joint_vel"] = ref.object_joint_vel[frames]
         return state
 
@@ -236,12 +241,13 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
         reference: Reference,
         margin: int = 1,
         noise: Mapping[str, float | Sequence[float]] | None = None,
+        held_noise: float = 1.0,
         bins: int = 20,
         uniform_share: float = 0.5,
         decay: float = 0.999,
         lead: int = 25,
     ):
-        super().__init__(reference, "uniform", margin, noise)
+        super().__init__(reference, "uniform", margin, noise, held_noise)
         self.uniform_share, self.decay, self.lead = uniform_share, decay, lead
         self.register_buffer("failures", torch.zeros(bins))
 

@@ -1,0 +1,43 @@
+"""Options of the scripts: `key=value` arguments checked against a dataclass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any, TypeVar
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from hdmi.build import ConfigError
+
+T = TypeVar("T")
+
+
+def parse_options(cls: type[T], arguments: Sequence[str]) -> T:
+    """Options from `key=value` arguments; what is not given has the dataclass's default.
+
+    Raises:
+        ConfigError: for an argument without `=`, an unknown key, or a value of the wrong type.
+    """
+    known = [f.name for f in fields(cls)]  # type: ignore[arg-type]
+    for argument in arguments:
+        key, equals, _ = argument.partition("=")
+        if not equals:
+            raise ConfigError(f"{argument!r}: expected key=value; the keys are {', '.join(known)}")
+        if key not in known:
+            raise ConfigError(f"unknown option {key!r}; there is {', '.join(known)}")
+    try:
+        options = OmegaConf.merge(OmegaConf.structured(cls), OmegaConf.from_cli(list(arguments)))
+        return OmegaConf.to_object(options)  # type: ignore[return-value]
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"{error.full_key}: {str(error).splitlines()[0]}") from error
+
+
+def parse_terminations(value: Any) -> list[str] | None:
+    """`all` (those of the training) -> None, `none` -> [], a list or a single name -> names."""
+    if value is None or value == "none":
+        return []
+    if value == "all":
+        return None
+    return [str(name) for name in (value if isinstance(value, list) else [value])]

@@ -1,0 +1,152 @@
+"""Speed of raw physics, of the environment with all transforms, of the learner and of training, in one run.
+
+`python scripts/benchmark.py [any option of train.py]`. Nothing else should run on the machine. Figures are control
+steps per second; blocks of the measurements alternate and medians are reported, so that the ratios hold even where the
+machine's speed drifts. The last line of the output is one JSON object.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import hydra
+import mujoco
+import torch
+from mujoco.batch import Batch
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+from tensordict import TensorDictBase
+from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
+
+from hdmi.build import make_transforms
+from hdmi.learning import Trainer
+
+_BLOCKS, _STEPS, _ITERATIONS = 7, 20, 4
+
+
+class RawPhysics:
+    """MuJoCo's Batch alone on the model of an environment, from the environment's present states and targets."""
+
+    def __init__(self, env: TransformedEnv, num_threads: int):
+        self.base = env.base_env
+        self.batch = Batch(self.base.scene.model, self.base.num_envs, num_threads, persistent=True)
+
+    def step(self, count: int) -> float:
+        """Control steps of all worlds per second."""
+        for field in ("qpos", "qvel", "ctrl"):
+            self.batch.bind(field)[:] = self.base.backend.data(field).numpy()
+        self.batch.forward()
+        start = time.perf_counter()
+        for _ in range(count):
+            self.batch.step(nstep=self.base.scene.sim.decimation, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        return self.base.num_envs * count / (time.perf_counter() - start)
+
+
+def step_env(env: TransformedEnv, carry: TensorDictBase, policy: Any, count: int) -> tuple[float, TensorDictBase]:
+    """Steps with resets under the policy's actions; policy time is not counted."""
+    spent = 0.0
+    for _ in range(count):
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+            carry = policy(carry)
+        start = time.perf_counter()
+        _, carry = env.step_and_maybe_reset(carry)
+        spent += time.perf_counter() - start
+    return env.base_env.num_envs * count / spent, carry
+
+
+def transform_times(
+    env: TransformedEnv, names: list[str], carry: TensorDictBase, policy: Any, count: int
+) -> dict[str, float]:
+    """Milliseconds per control step that each transform takes, resets included."""
+    spent: dict[str, float] = defaultdict(float)
+
+    def timed(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            start = time.perf_counter()
+            result = method(*args, **kwargs)
+            spent[name] += time.perf_counter() - start
+            return result
+
+        return call
+
+    methods = ("_step", "_reset", "_inv_call", "_reset_env_preprocess")
+    for name, transform in zip(names, env.transform.transforms, strict=True):
+        for method in methods:
+            object.__setattr__(transform, method, timed(name, getattr(transform, method)))
+    step_env(env, carry, policy, count)
+    for transform in env.transform.transforms:
+        for method in methods:
+            object.__delattr__(transform, method)
+    return {name: 1e3 * value / count for name, value in spent.items()}
+
+
+@hydra.main(config_path="../conf", config_name="config", version_base="1.3")
+def main(cfg: DictConfig) -> None:
+    console = Console()
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = Trainer(cfg, Path(folder))
+        env, policy = trainer.env, trainer.actor
+        raw = RawPhysics(env, cfg.num_threads)
+        with torch.no_grad():
+            carry = env.reset()
+        _, carry = step_env(env, carry, policy, _STEPS)
+        raw.step(_STEPS)
+        raw_sps, env_sps = [], []
+        for _ in range(_BLOCKS):
+            raw_sps.append(raw.step(_STEPS))
+            speed, carry = step_env(env, carry, policy, _STEPS)
+            env_sps.append(speed)
+        names = [name for name, _ in make_transforms(cfg, trainer.task)] + ["select outputs"]
+        costs = transform_times(env, names, carry, policy, _STEPS)
+
+        batches = iter(trainer.collector)
+        collect, learn, train, raw_beside = [], [], [], []
+        for i in range(_ITERATIONS + 1):
+            start = time.perf_counter()
+            with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+                batch = next(batches)
+            middle = time.perf_counter()
+            trainer.update(batch)
+            end = time.perf_counter()
+            if i:  # the first one warms up
+                frames = trainer.frames_per_batch
+                collect.append(frames / (middle - start))
+                learn.append(frames / (end - middle))
+                train.append(frames / (end - start))
+                raw_beside.append(raw.step(_STEPS))
+        trainer.collector.shutdown()
+
+    median = statistics.median
+    result = {
+        "raw_physics_sps": median(raw_sps + raw_beside),
+        "env_sps": median(env_sps),
+        "env_ratio": median(e / r for e, r in zip(env_sps, raw_sps, strict=True)),
+        "collect_sps": median(collect),
+        "learn_sps": median(learn),
+        "train_sps": median(train),
+        "train_ratio": median(t / r for t, r in zip(train, raw_beside, strict=True)),
+        "num_envs": cfg.num_envs,
+        "task": cfg.task.name,
+    }
+    table = Table(title="Time per control step by transform, resets included", title_justify="left")
+    table.add_column("transform")
+    table.add_column("ms", justify="right")
+    for name, cost in sorted(costs.items(), key=lambda item: -item[1])[:25]:
+        table.add_row(name, f"{cost:.3f}")
+    table.add_row(f"all {len(costs)}", f"{sum(costs.values()):.3f}")
+    console.print(table)
+    step_ms = 1e3 * cfg.num_envs / result["env_sps"]
+    console.print(f"one control step of {cfg.num_envs} worlds with everything on: {step_ms:.1f} ms")
+    print(json.dumps({key: round(v, 4) if isinstance(v, float) else v for key, v in result.items()}))
+
+
+if __name__ == "__main__":
+    main()

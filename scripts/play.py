@@ -1,0 +1,133 @@
+"""Plays a policy, or an agent that needs none, and writes a video or opens a window.
+
+    python scripts/play.py checkpoint=RUN [start=FRAME] [out=play.mp4] [window=true]
+    python scripts/play.py agent=zero|random|reference [task=lift_box] ...
+
+`zero` and `random` act on the environment of the default config; `reference` shows the motion without physics. The
+reference is drawn as a ghost, contact points are yellow while contact is intended, contact forces are red. The video
+ends a second after a failure, those pictures with a red frame.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+
+from hdmi.build import ConfigError, Task, make_task
+from hdmi.cli import USER_ERRORS
+from hdmi.evaluation import RenderingError
+from hdmi.evaluation.options import parse_options
+from hdmi.evaluation.protocol import Policy, load_checked_policy, run_folder_of
+from hdmi.evaluation.video import Moment, Overlay, every, play_moments, replay, show, write_video
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+AGENTS = ("zero", "random", "reference")
+
+
+@dataclass
+class Options:
+    """See the module."""
+
+    checkpoint: str | None = None
+    agent: str | None = None
+    task: str | None = None  # for an agent: lift_box; for a checkpoint: that it must be of
+    motion_root: str | None = None
+    start: int = 0  # frame of the reference
+    seed: int = 0
+    out: str | None = None  # play.mp4 in the run folder, or play_<task>_<agent>.mp4 here
+    window: bool = False
+    stride: int = 2  # control steps per picture
+    width: int = 640
+    height: int = 480
+
+
+def compose_config(task: str, motion_root: str | None = None) -> DictConfig:
+    """The default config with a task.
+
+    Raises:
+        ConfigError: if there is no such task.
+    """
+    tasks = sorted(path.stem for path in (CONF / "task").glob("*.yaml"))
+    if task not in tasks:
+        raise ConfigError(f"task: there is no {task!r}; there is {', '.join(tasks)}")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = compose("config", overrides=[f"task={task}"])
+    cfg.motion_root = motion_root
+    return cfg
+
+
+def make_agent(agent: str, action_size: int) -> Policy:
+    """An agent that looks at nothing: `zero`, or `random` in [-1, 1]."""
+
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        action = torch.zeros(*tensordict.batch_size, action_size)
+        return tensordict.set("action", action if agent == "zero" else action.uniform_(-1, 1))
+
+    return act
+
+
+def prepare(options: Options) -> tuple[Task, Iterator[Moment], Path]:
+    """What the options ask to play: its task, its moments, and where the video goes.
+
+    Raises:
+        ConfigError, MotionError, CheckpointError: for options that cannot be met.
+    """
+    if (options.checkpoint is None) == (options.agent is None):
+        raise ConfigError(f"give either checkpoint=RUN or agent=, one of {', '.join(AGENTS)}")
+    for name in ("stride", "width", "height"):
+        if getattr(options, name) < 1:
+            raise ConfigError(f"{name}: expected at least 1, got {getattr(options, name)}")
+    policy: Policy | None = None
+    if options.checkpoint is not None:
+        policy, cfg, info = load_checked_policy(options.checkpoint, options.task)
+        cfg.motion_root = options.motion_root or cfg.motion_root
+        out = run_folder_of(Path(info["file"])) / "play.mp4"
+    else:
+        if options.agent not in AGENTS:
+            raise ConfigError(f"agent: there is no {options.agent!r}; there is {', '.join(AGENTS)}")
+        cfg = compose_config(options.task or "lift_box", options.motion_root)
+        out = Path(f"play_{cfg.task.name}_{options.agent}.mp4")
+        if options.agent != "reference":
+            policy = make_agent(options.agent, cfg.action.history.size)
+    task = make_task(cfg)
+    last = task.reference.num_frames - 1
+    if not 0 <= options.start < last:
+        raise ConfigError(f"start: expected a frame from 0 to {last - 1}, got {options.start}")
+    if policy is None:
+        moments = replay(task, options.start)
+    else:
+        moments = play_moments(cfg, task, policy, options.start, options.seed)
+    return task, moments, Path(options.out or out)
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the script; returns its exit status."""
+    if arguments in (["-h"], ["--help"]):
+        print(__doc__)
+        return 0
+    try:
+        options = parse_options(Options, arguments)
+        task, moments, out = prepare(options)
+        control_dt = task.scene.sim.control_dt
+        overlay = Overlay(task, ghost=options.agent != "reference")
+        if options.window:
+            show(moments, overlay, control_dt)
+            return 0
+        size = (options.height, options.width)
+        fps = 1 / (control_dt * options.stride)
+        print(write_video(out, every(moments, options.stride), overlay, fps, size))
+    except (*USER_ERRORS, RenderingError, OSError) as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
