@@ -112,9 +112,10 @@ class TestMotionReference:
         assert ("ref", "future", "joint_pos") not in td.keys(True)
 
 
-class TestReferenceStateInitialization:
-    NOISE = {"root_pos": [0.1, 0.0, 0.05], "joint_pos": 0.2, "object_pos": [0.0, 0.1, 0.0], "root_rpy": [0.0, 0.0, 0.3]}
+NOISE = {"root_pos": [0.1, 0.0, 0.05], "joint_pos": 0.2, "object_pos": [0.0, 0.1, 0.0], "root_rpy": [0.0, 0.0, 0.3]}
 
+
+class TestReferenceStateInitialization:
     def test_without_noise_physics_starts_in_the_reference_state(self, reference):
         motion = T.MotionReference(reference, ["pelvis"], ["waist_.*"])
         td = physics(8, T.ReferenceStateInitialization(reference), motion).reset()
@@ -135,7 +136,7 @@ class TestReferenceStateInitialization:
         close(object_["ang_vel"], reference.object_ang_vel[frames], 1e-4)
 
     def test_noise_is_uniform_within_its_half_range(self, reference):
-        init = T.ReferenceStateInitialization(reference, noise=self.NOISE)
+        init = T.ReferenceStateInitialization(reference, noise=NOISE)
         frames = torch.randint(init.num_starts, (2000,), generator=torch.Generator().manual_seed(0))
         torch.manual_seed(0)
         state = init.initial_state(frames)
@@ -295,18 +296,19 @@ class TestActionSmoothing:
             T.ActionSmoothing(alpha=alpha)
 
 
-class TestActionDelay:
-    # age in control steps of the target of each of the four physics steps: ceil((d - k) / 4), not below 0
-    AGES = {
-        0: (0, 0, 0, 0),
-        1: (1, 0, 0, 0),
-        2: (1, 1, 0, 0),
-        3: (1, 1, 1, 0),
-        4: (1, 1, 1, 1),
-        5: (2, 1, 1, 1),
-        6: (2, 2, 1, 1),
-    }
+# age in control steps of the target of each of the four physics steps: ceil((d - k) / 4), not below 0
+AGES = {
+    0: (0, 0, 0, 0),
+    1: (1, 0, 0, 0),
+    2: (1, 1, 0, 0),
+    3: (1, 1, 1, 0),
+    4: (1, 1, 1, 1),
+    5: (2, 1, 1, 1),
+    6: (2, 2, 1, 1),
+}
 
+
+class TestActionDelay:
     @pytest.mark.parametrize("delay", AGES)
     def test_which_target_each_physics_step_uses(self, delay):
         env = wrap(blank(2), T.ActionDelay((delay, delay), decimation=4, size=4))
@@ -315,9 +317,9 @@ class TestActionDelay:
             td = env.step_mdp(env.step(td.set("action", torch.full((2, 4), float(t)))))
             assert env.base_env.received.shape == (2, 4, 4)
             # before the first target arrives, the first target
-            expected = [float(max(t - age, 0)) for age in self.AGES[delay]]
+            expected = [float(max(t - age, 0)) for age in AGES[delay]]
             assert env.base_env.received[1, :, 2].tolist() == expected
-            assert self.AGES[delay] == tuple(max(math.ceil((delay - k) / 4), 0) for k in range(4))
+            assert AGES[delay] == tuple(max(math.ceil((delay - k) / 4), 0) for k in range(4))
 
     def test_all_delays_of_the_range_are_drawn(self):
         env = wrap(blank(300), T.ActionDelay((2, 6), decimation=4, size=4))
@@ -561,7 +563,7 @@ class TestFrames:
     def test_moving_the_entire_scene_changes_nothing(self):
         still = self.observe(torch.tensor([1.0, 0, 0, 0]), torch.zeros(3))
         moved = self.observe(quat_from_euler(torch.tensor([0.5, 1.0, -2.5])), torch.tensor([3.0, -7.0, 2.0]))
-        for key in still.keys():
+        for key in ("pose", "points_in_root", "velocity_in_root"):
             close(moved[key], still[key], 1e-5)
         assert still["pose"].shape == (1, 9)
         close(still["points_in_root"][:, 3:], torch.zeros(1, 3), 1e-5)  # the root itself
@@ -652,7 +654,7 @@ class TestRewardTerms:
     def env(self, name):
         make, entries, term = TERMS[name]
         script = {key: constant(value) for key, value in entries.items()}
-        return (script | make_script([])) if not script else script, make(), term
+        return script or make_script([]), make(), term
 
     def test_weighted_in_the_reward_and_raw_beside_it(self, name):
         script, transform, term = self.env(name)
@@ -774,7 +776,7 @@ class TestRandomization:
         return model.body(name).id
 
     def test_mass_scale(self, model):
-        env, backend = self.drawn(T.MassRandomization(model, ["pelvis", "torso_link"], scale=[0.5, 1.5]))
+        _, backend = self.drawn(T.MassRandomization(model, ["pelvis", "torso_link"], scale=[0.5, 1.5]))
         bodies = [self.body(model, name) for name in ("pelvis", "torso_link")]
         factor = backend.model("body_mass")[:, bodies] / torch.from_numpy(model.body_mass[bodies])
         assert 0.5 <= factor.min() < 0.6
@@ -802,7 +804,7 @@ class TestRandomization:
             T.MassRandomization(model, ["box"])
 
     def test_center_of_mass(self, model):
-        env, backend = self.drawn(T.CenterOfMassRandomization(model, ["torso_link"], shift=0.05))
+        _, backend = self.drawn(T.CenterOfMassRandomization(model, ["torso_link"], shift=0.05))
         torso = self.body(model, "torso_link")
         off = backend.model("body_ipos")[:, torso] - torch.from_numpy(model.body_ipos[torso])
         assert 0.04 < off.abs().max() <= 0.05 + 1e-6
@@ -828,7 +830,7 @@ class TestRandomization:
 
     def test_joint_friction_and_damping(self, model):
         term = T.ObjectJointRandomization(model, "waist_yaw_joint", friction=[0.1, 0.2], damping=[0.3, 0.4])
-        env, backend = self.drawn(term)
+        _, backend = self.drawn(term)
         dof = int(model.joint("waist_yaw_joint").dofadr[0])
         for field, (low, high) in {"dof_frictionloss": (0.1, 0.2), "dof_damping": (0.3, 0.4)}.items():
             values = backend.model(field)[:, dof]

@@ -34,12 +34,14 @@ from hdmi.motion import Reference
 SIZE = (480, 640)  # height, width
 AFTER_FAILURE = 1.0  # s that are still shown
 
-_GHOST = (0.20, 0.45, 0.95, 0.18)
+_GHOST = (0.20, 0.45, 0.95, 0.22)
+_GHOST_INSET = 0.005  # m
 _INTENDED = (1.0, 0.82, 0.10, 1.0)
 _NOT_INTENDED = (0.55, 0.55, 0.58, 0.8)
 _FORCE = (0.90, 0.12, 0.12, 1.0)
-_POINT_RADIUS = 0.018  # m
-_FORCE_SCALE = 0.006  # m/N
+_POINT_RADIUS = 0.02  # m
+_FORCE_SCALE = 0.015  # m/N
+_MAX_ARROW = 0.6  # m
 _MIN_FORCE = 1.0  # N; less is not drawn
 _FRAME_WIDTH = 6  # pixels of the red frame after a failure
 
@@ -75,15 +77,18 @@ def play(env: TransformedEnv, task: Task, policy: Policy, causes: Iterable[str],
         env: that starts episodes from frame `start`.
         causes: names of the terminations.
     """
-    world = env.base_env.backend.world
+
+    def world() -> tuple[mujoco.MjModel, mujoco.MjData]:
+        return env.base_env.backend.world(0)
+
     failure, left = None, round(AFTER_FAILURE / task.scene.sim.control_dt)
     tensordict = env.reset()
-    yield Moment(*world(0), start)
+    yield Moment(*world(), start)
     for frame in range(start + 1, task.reference.num_frames):
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             stepped = env.step(policy(tensordict))
         failure = failure or _failure(stepped["next"], causes)
-        yield Moment(*world(0), frame, failure)
+        yield Moment(*world(), frame, failure)
         left -= failure is not None
         if left <= 0:
             return
@@ -153,7 +158,8 @@ class Overlay:
         for geom in scene.geoms[first : scene.ngeom]:
             geom.rgba[:] = _GHOST
             geom.matid = -1
-            geom.size[:] *= 1.01  # off the surfaces that it coincides with
+            # off the surfaces that it coincides with: of a perfect imitation only the robot is seen
+            geom.size[:] = np.maximum(geom.size - _GHOST_INSET, 0.5 * geom.size)
 
     def _draw_contact(self, moment: Moment, scene: mujoco.MjvScene, e: int) -> None:
         model, data, reference = moment.model, moment.data, self.task.reference
@@ -167,13 +173,17 @@ class Overlay:
         _sphere(scene, target, _POINT_RADIUS, _INTENDED if intended else _NOT_INTENDED)
         # the sensor reports what the effector exerts; drawn is what it feels
         force = -data.sensordata[parts.effector_sensors[e]]
-        if np.linalg.norm(force) >= _MIN_FORCE:
+        strength = np.linalg.norm(force)
+        if strength >= _MIN_FORCE:
             body = data.body(effector.body)
             hand = body.xpos + body.xmat.reshape(3, 3) @ np.asarray(effector.point)
-            _arrow(scene, hand, hand + _FORCE_SCALE * force, _FORCE)
+            length = min(_FORCE_SCALE * strength, _MAX_ARROW)
+            _arrow(scene, hand, hand + length * force / strength, _FORCE)
 
 
-def _add_geom(scene: mujoco.MjvScene, kind: int, size: np.ndarray, pos: np.ndarray, rgba: tuple[float, ...]) -> object:
+def _add_geom(
+    scene: mujoco.MjvScene, kind: int, size: np.ndarray, pos: np.ndarray, rgba: tuple[float, ...]
+) -> mujoco.MjvGeom | None:
     if scene.ngeom >= scene.maxgeom:
         return None
     geom = scene.geoms[scene.ngeom]
@@ -183,7 +193,9 @@ def _add_geom(scene: mujoco.MjvScene, kind: int, size: np.ndarray, pos: np.ndarr
 
 
 def _sphere(scene: mujoco.MjvScene, pos: np.ndarray, radius: float, rgba: tuple[float, ...]) -> None:
-    _add_geom(scene, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, radius), pos, rgba)
+    geom = _add_geom(scene, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, radius), pos, rgba)
+    if geom is not None:
+        geom.emission = 0.6
 
 
 def _arrow(scene: mujoco.MjvScene, start: np.ndarray, end: np.ndarray, rgba: tuple[float, ...]) -> None:
@@ -266,6 +278,7 @@ def show(moments: Iterable[Moment], overlay: Overlay, control_dt: float) -> None
                 data = mujoco.MjData(moment.model)
                 window = mujoco.viewer.launch_passive(moment.model, data, show_left_ui=False, show_right_ui=False)
                 window.cam.distance, window.cam.azimuth, window.cam.elevation = 2.8, 130.0, -14.0
+            assert data is not None
             if not window.is_running():
                 return
             with window.lock():

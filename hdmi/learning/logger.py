@@ -18,17 +18,17 @@ class RunLogger:
 
     Args:
         cfg: the whole config; `cfg.logger.wandb` is null or {mode, project}.
-        first_iteration: rows of this and later iterations are dropped, so that a resumed run continues its file.
+        last_iteration: of a run to continue; rows after it are dropped.
     """
 
-    def __init__(self, folder: Path, cfg: DictConfig, first_iteration: int = 0):
+    def __init__(self, folder: Path, cfg: DictConfig, last_iteration: int = 0):
         self.path = folder / "metrics.csv"
         self.lost_rows = 0
         self._fields: list[str] = []
         if self.path.is_file():
             with self.path.open(newline="") as file:
                 reader = csv.DictReader(file)
-                rows = [row for row in reader if int(row["iteration"] or 0) < first_iteration]
+                rows = [row for row in reader if int(row["iteration"] or 0) <= last_iteration]
                 self._fields = list(reader.fieldnames or [])
             self._rewrite(rows)
         self._wandb = _start_wandb(folder, cfg) if cfg.logger.wandb is not None else None

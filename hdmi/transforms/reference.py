@@ -232,6 +232,7 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
     drawn with probability `uniform_share / bins + (1 - uniform_share) * failures`, failures normalised.
 
     Args:
+        start: `uniform` as long as nothing has failed, or `first`, always.
         bins: number of bins. uniform_share: of starts that ignore failures. decay: of the average, per termination
             batch. lead: frames before the failure's bin that the start is moved ahead.
     """
@@ -239,6 +240,7 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
     def __init__(
         self,
         reference: Reference,
+        start: Literal["uniform", "first"] = "uniform",
         margin: int = 1,
         noise: Mapping[str, float | Sequence[float]] | None = None,
         held_noise: float = 1.0,
@@ -247,11 +249,13 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
         decay: float = 0.999,
         lead: int = 25,
     ):
-        super().__init__(reference, "uniform", margin, noise, held_noise)
+        super().__init__(reference, start, margin, noise, held_noise)
         self.uniform_share, self.decay, self.lead = uniform_share, decay, lead
         self.register_buffer("failures", torch.zeros(bins))
 
     def sample_frames(self, batch_size: torch.Size, device: torch.device | None) -> Tensor:
+        if self.start == "first":
+            return super().sample_frames(batch_size, device)
         bins, total = len(self.failures), self.failures.sum()
         weights = torch.full_like(self.failures, 1 / bins)
         if total > 0:

@@ -1,0 +1,325 @@
+"""Configs: ablations are node flips, mistakes are named, tasks run, and runs can be repeated."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from pathlib import Path
+
+import pytest
+import torch
+from mocks import CONF, assert_same, drive, lift_box, load_config
+from omegaconf import OmegaConf
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from hdmi.build import ConfigError, build, describe, make_env, make_task, make_transforms
+from hdmi.motion import MotionError
+
+CONCATENATIONS = ("observation.critic", "observation.policy")
+ABLATIONS = sorted(path.stem for path in (CONF / "ablation").glob("*.yaml"))
+
+PER_WORLD = ("robot_mass", "robot_com", "robot_friction", "object_scale")
+OBSERVED = {"observation.policy.object_pose", "noise.object_position", "noise.object_heading"}
+POINTS = {"observation.policy.contact_points", "noise.contact_points", "noise.contact_points_episode"}
+# nodes that an ablation takes out, and those that it changes
+EXPECTED: dict[str, tuple[set[str], set[str]]] = {
+    "no_contact_observation": (POINTS | {"observation.policy.contact_labels"}, set()),
+    "no_interaction_reward": ({"reward.interaction"}, set()),
+    "no_interaction_reward_no_contact_termination": ({"reward.interaction", "termination.lost_contact"}, set()),
+    "no_object_observation": (OBSERVED | POINTS, set()),
+    "no_randomization": (
+        {f"randomization.{name}" for name in ("robot_mass", "robot_com", "robot_friction", "joint_offset")}
+        | {f"randomization.object_{name}" for name in ("mass", "friction", "scale")}
+        | {"action.delay", "action.smoothing"}
+        | {f"noise.{name}" for name in ("root_ang_vel", "gravity", "joint_pos", "object_position", "object_heading")}
+        | {"noise.contact_points", "noise.contact_points_episode"},
+        set(),
+    ),
+    "no_residual": (set(), {"action.target"}),
+    "no_residual_no_body_termination": ({"termination.body_local_pose"}, {"action.target"}),
+    "no_rsi": (set(), {"reset.state"}),
+}
+
+
+@cache
+def env_of(*overrides: str) -> TransformedEnv:
+    """Built once; the scene is shared."""
+    return make_env(load_config(*overrides), 2, lift_box())
+
+
+@cache
+def stack_of(*overrides: str) -> dict[str, str]:
+    """Node -> class and settings of its transform."""
+    cfg = load_config(*overrides)
+    out = {}
+    for name, transform in make_transforms(cfg, lift_box()):
+        node = None if name in CONCATENATIONS else OmegaConf.select(cfg, name)
+        out[name] = f"{type(transform).__name__} {OmegaConf.to_container(node, resolve=True) if node else ''}"
+    return out
+
+
+class TestAblations:
+    def test_all_are_expected(self):
+        assert set(ABLATIONS) == set(EXPECTED)
+
+    @pytest.mark.parametrize("name", ABLATIONS)
+    def test_changes_exactly_its_nodes(self, name):
+        default, ablated = stack_of(), stack_of(f"+ablation={name}")
+        gone, changed = EXPECTED[name]
+        assert set(default) - set(ablated) == gone
+        assert set(ablated) <= set(default)
+        # what remains keeps its place
+        assert list(ablated) == [node for node in default if node in ablated]
+        assert {node for node in ablated if ablated[node] != default[node]} == changed
+
+    def test_what_they_change_to(self):
+        assert stack_of()["action.target"].startswith("ResidualAction")
+        assert stack_of("+ablation=no_residual")["action.target"].startswith("DefaultPoseAction")
+        assert "'start': 'first'" in stack_of("+ablation=no_rsi")["reset.state"]
+
+    @pytest.mark.parametrize("name", ["no_object_observation", "no_randomization"])
+    def test_steps(self, name):
+        env = env_of(f"+ablation={name}")
+        rollout = env.rollout(3, break_when_any_done=False)
+        assert rollout["next", "reward"].isfinite().all()
+        # of the object 3 + 6 figures, of two contact points 3 each
+        lost = env_of().observation_spec["policy"].shape[-1] - env.observation_spec["policy"].shape[-1]
+        assert lost == (9 + 2 * 3 if name == "no_object_observation" else 0)
+
+    def test_start_at_the_first_frame(self):
+        cfg = load_config("+ablation=no_rsi")
+        reset = dict(make_transforms(cfg, lift_box()))["reset.state"]
+        assert reset.sample_frames(torch.Size([100]), None).unique().tolist() == [0]
+
+    @pytest.mark.parametrize("path", sorted(CONF.glob("**/*.yaml")), ids=lambda p: str(p.relative_to(CONF)))
+    def test_configs_name_classes_and_no_other_code(self, path: Path):
+        text = path.read_text(encoding="utf-8")
+        assert "_partial_" not in text
+        assert "!!python" not in text
+        targets = [
+            line.split("_target_:")[1].split(",")[0].strip(" }") for line in text.splitlines() if "_target_:" in line
+        ]
+        assert all(target.startswith(("hdmi.", "torchrl.")) for target in targets)
+
+
+class TestMistakes:
+    @pytest.mark.parametrize(
+        ("override", "message"),
+        [
+            ("+reward.interaction.sigma=1", r"reward\.interaction: InteractionReward has no \['sigma'\]; it takes"),
+            ("reward.interaction._target_=hdmi.transforms.Nothing", r"reward\.interaction: _target_ .*Nothing"),
+            ("reward.interaction.reduce=sum", r"reward\.interaction.*reduce is 'mean' or 'max'"),
+            ("reward.joint_tracking.sigmas=[0.25]", r"reward\.joint_tracking.*one sigma"),
+            ("reward.joint_tracking.sigmas=[0.25,0]", r"reward\.joint_tracking.*positive"),
+            ("action.delay.substeps=[6,2]", r"action\.delay.*substeps.*\[6, 2\]"),
+            ("action.smoothing.alpha=[1.0,0.8]", r"action\.smoothing.*alpha"),
+            ("~action.target._target_", r"action\.target: has no _target_"),
+            ("reset.state.start=middle", r"reset\.state.*'middle'"),
+            ("+reset.state.noise.color=1", r"reset\.state.*unknown \['color'\]"),
+            ("termination.root_pose.min_steps=0", r"termination\.root_pose.*min_steps"),
+            ("termination.root_pose.thresholds=[0.5]", r"termination\.root_pose.*threshold"),
+            ("randomization.robot_mass.per=step", r"randomization\.robot_mass.*'step'"),
+            ("randomization.robot_mass.bodies=[tail]", r"randomization\.robot_mass.*tail"),
+            ("reference_set.joints=[tail_joint]", r"reference\.motion.*tail_joint"),
+            ("noise.gravity_history.steps=0", r"noise\.gravity_history.*steps"),
+            ("stack=[reset,magic]", r"stack.*'magic'"),
+        ],
+    )
+    def test_in_the_stack(self, override, message):
+        if "reduce" in override:
+            override = f"+{override}"
+        with pytest.raises(ConfigError, match=message):
+            make_transforms(load_config(override), lift_box())
+
+    @pytest.mark.parametrize(
+        ("override", "message"),
+        [
+            ("+robot.color=red", r"robot: unknown \['color'\]"),
+            ("+sim.speed=2", r"sim: unknown \['speed'\]"),
+            ("robot.feet=paw", r"feet.*'paw'"),
+            ("robot.effector=tongs", r"effector.*'tongs'"),
+            ("sim.integrator=verlet", r"integrator.*'verlet'"),
+            ("sim.cone=round", r"cone.*'round'"),
+            ("task.object._target_=hdmi.assets.Nothing", r"task\.object: _target_ .*Nothing"),
+            ("+task.object.color=red", r"task\.object: ObjectConfig has no \['color'\]"),
+            ("task.effectors.0.body=tail_link", r"tail_link"),
+        ],
+    )
+    def test_in_the_task(self, override, message):
+        with pytest.raises(ConfigError, match=message):
+            make_task(load_config(override))
+
+    def test_missing_motion(self, tmp_path):
+        with pytest.raises(MotionError, match=r"'nowhere': not under .*there: .*lift_box"):
+            make_task(load_config("task.motion=nowhere"))
+        with pytest.raises(MotionError, match="no motions"):
+            make_task(load_config(f"motion_root={tmp_path}"))
+
+    def test_motion_without_labels(self, write_motion):
+        folder = write_motion(drop=["object_contact"])
+        with pytest.raises(MotionError, match=r"'stroll'.*no object_contact.*2 effectors"):
+            make_task(load_config(f"motion_root={folder.parent}", "task.motion=stroll", "task.scenery=[]"))
+
+    def test_motion_without_the_object(self, write_motion):
+        folder = write_motion()
+        with pytest.raises(MotionError, match=r"lacks the task's object 'crate'"):
+            make_task(load_config(f"motion_root={folder.parent}", "task.motion=stroll", "task.object.name=crate"))
+
+    def test_reads_of_what_the_stack_does_not_write(self):
+        """Leaving out a part that others read is told with the reader and the key."""
+        cfg = load_config("tracking.contact_points=null")
+        with pytest.raises((ConfigError, KeyError), match=r"contact.*target_pos"):
+            make_env(cfg, 2, lift_box())
+
+    def test_build_wants_a_target(self):
+        with pytest.raises(ConfigError, match="here: has no _target_"):
+            build({"a": 1}, "here")
+
+
+def test_description_lists_the_stack():
+    stack = make_transforms(load_config(), lift_box())
+    table = describe(stack)
+    assert table.row_count == len(stack)
+    assert list(table.columns[0].cells) == [name for name, _ in stack]
+
+
+def test_embedded_task_passes_the_specs():
+    check_env_specs(env_of())
+
+
+@pytest.mark.parametrize("name", ["move_suitcase", "push_box", "walk"])
+def test_public_tasks(name, public_motions):
+    env = make_env(load_config(f"task={name}", f"motion_root={public_motions}"), 2)
+    check_env_specs(env)
+    rollout = env.rollout(5, break_when_any_done=False)
+    assert rollout["policy"].isfinite().all()
+    assert rollout["next", "reward"].isfinite().all()
+
+
+def scripted(env: EnvBase, steps: int, start: TensorDictBase | None = None) -> TensorDictBase:
+    return torch.stack(drive(env, steps, start=start), -1)
+
+
+class TestRepeatability:
+    def test_same_seed_same_rollout(self):
+        env = env_of()
+        env.reset()
+
+        def run(seed: int) -> TensorDictBase:
+            env.set_seed(seed)
+            return env.rollout(5, break_when_any_done=False)
+
+        # per-world draws stay what they are
+        a, b, c = run(3), run(3), run(4)
+        assert_same(a, b)
+        assert not torch.equal(a["policy"], c["policy"])
+
+    def test_seed_of_a_fresh_environment_is_that_of_a_used_one(self):
+        """What is computed at first use draws no random numbers."""
+        env = make_env(load_config(*(f"randomization.{name}.per=episode" for name in PER_WORLD)), 2, lift_box())
+
+        def run() -> TensorDictBase:
+            env.set_seed(3)
+            return env.rollout(3, break_when_any_done=False)
+
+        assert_same(run(), run())
+
+    def test_state_of_the_simulation(self):
+        env = env_of()
+        torch.manual_seed(0)
+        start = env.step_mdp(scripted(env, 3)[..., -1])
+        state = env.base_env.get_state()
+        torch.manual_seed(1)
+        first = scripted(env, 5, start.clone())
+        env.reset()
+        scripted(env, 2)
+        env.base_env.set_state(state)
+        torch.manual_seed(1)
+        assert_same(scripted(env, 5, start.clone()), first)
+
+    def test_state_is_a_copy(self):
+        env = env_of()
+        env.reset()
+        state = env.base_env.get_state()
+        before = state.clone()
+        scripted(env, 2)
+        assert_same(state, before)
+
+
+class TestDivergence:
+    def test_a_diverged_world_is_ended_counted_and_reset(self):
+        env = env_of("+ablation=no_randomization")
+        base = env.base_env
+        torch.manual_seed(0)
+        start = env.reset()
+        state = base.get_state()
+        action = torch.zeros(env.action_spec.shape)
+        torch.manual_seed(1)
+        sound = env.step(start.clone().set("action", action))["next"]
+        base.set_state(state)
+        count = base.num_diverged
+        base.backend.data("qvel")[0] = 1e9
+        torch.manual_seed(1)
+        step, following = env.step_and_maybe_reset(start.clone().set("action", action))
+        ended = step["next"]
+        assert base.num_diverged == count + 1
+        for key in ("diverged", "terminated", "done"):
+            assert ended[key].flatten().tolist() == [True, False]
+        for key in ended.keys(True, True):
+            value = ended.get(key)
+            assert not value.is_floating_point() or value.isfinite().all(), key
+            assert torch.equal(value[1], sound.get(key)[1]), key
+        assert not following["done"].any()
+        after = env.step(following.set("action", action))["next"]
+        assert not after["diverged"].any()
+        assert after["step_count"].flatten().tolist() == [1, 2]
+        assert after["policy"].isfinite().all()
+
+    def test_not_a_number(self):
+        env = env_of("+ablation=no_randomization")
+        start = env.reset()
+        env.base_env.backend.data("qpos")[1, 2] = float("nan")
+        step, following = env.step_and_maybe_reset(start.set("action", torch.zeros(env.action_spec.shape)))
+        assert step["next", "terminated"].flatten().tolist() == [False, True]
+        assert following["policy"].isfinite().all()
+
+
+def make_default() -> TransformedEnv:
+    return make_env(load_config(), 2, lift_box())
+
+
+class TestInTorchRL:
+    def test_serial(self):
+        env = SerialEnv(2, make_default)
+        rollout = env.rollout(3, break_when_any_done=False)
+        assert rollout.shape == (2, 2, 3)
+        assert rollout["next", "policy"].isfinite().all()
+
+    def test_parallel(self):
+        env = ParallelEnv(2, partial(make_default))
+        try:
+            rollout = env.rollout(3, break_when_any_done=False)
+        finally:
+            env.close()
+        assert rollout.shape == (2, 2, 3)
+        assert rollout["next", "policy"].isfinite().all()
+        steps = rollout["next", "ref", "step"] - rollout["ref", "step"]
+        assert (steps[~rollout["next", "done"]] == 1).all()
+
+    def test_collector(self):
+        env = env_of()
+
+        def policy(tensordict: TensorDictBase) -> TensorDictBase:
+            return tensordict.set("action", 0.1 * torch.ones(env.action_spec.shape))
+
+        collector = Collector(env, policy, frames_per_batch=40, total_frames=80)
+        batches = [batch.clone() for batch in collector]
+        assert [batch.shape for batch in batches] == [(2, 20), (2, 20)]
+        a, b = batches
+        assert (b["ref", "step"][:, 0] == a["next", "ref", "step"][:, -1])[~a["next", "done"][:, -1]].all()
+        everything: Tensor = torch.cat([a["next", "reward"], b["next", "reward"]], 1)
+        assert everything.isfinite().all()
+        assert len(everything.unique()) > 40

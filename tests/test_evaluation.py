@@ -1,0 +1,382 @@
+"""The evaluation protocol, its accounts, its files, and the scripts around it."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import imageio.v2 as imageio
+import pytest
+import torch
+from mocks import lift_box, load_config
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict
+
+from hdmi.build import ConfigError, make_env
+from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy, protocol, render_checkpoint, video
+from hdmi.evaluation.options import parse_options, parse_terminations
+from hdmi.evaluation.protocol import FirstEpisodes, StartAtFrame, evaluation_config, termination_names
+from hdmi.learning.checkpoint import CheckpointError, save_checkpoint
+from hdmi.learning.policy import make_networks
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+FIGURES = (
+    "success_rate", "survival", "joint_error", "body_error", "root_pos_error", "root_ori_error", "object_pos_error",
+    "object_ori_error", "contact_rate",
+)  # fmt: skip
+
+
+def script(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"script_{name}", SCRIPTS / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+def after(
+    terminated: list[bool], diverged: list[bool] | None = None, flags: dict[str, list[bool]] | None = None, **metrics
+) -> TensorDict:
+    """The `next` of a step, by hand."""
+    n = len(terminated)
+
+    def column(values: list) -> torch.Tensor:
+        return torch.tensor(values).reshape(n, 1)
+
+    nested = {
+        "terminated": column(terminated),
+        "diverged": column(diverged or [False] * n),
+        "metrics": {key: column(value) for key, value in metrics.items()},
+        "termination": {key: column(value) for key, value in (flags or {}).items()},
+    }
+    return TensorDict(nested, batch_size=[n])
+
+
+# -- accounts -------------------------------------------------------------------------------------------------
+
+
+def test_only_environments_that_survive_every_step_succeed():
+    episodes = FirstEpisodes(4, horizon=3, causes=["a"])
+    episodes.add(after([False, True, False, False]))
+    episodes.add(after([False, False, False, False], diverged=[False, False, True, False]))
+    episodes.add(after([False, False, False, True]))  # at the last frame: still a failure
+    assert episodes.success.tolist() == [True, False, False, False]
+    assert episodes.values()["survival"].tolist() == pytest.approx([1, 0, 1 / 3, 2 / 3])
+    assert episodes.summary()["success_rate"] == pytest.approx({"mean": 0.25, "std": 0.1875**0.5})
+
+
+def test_an_unfinished_episode_is_no_success():
+    episodes = FirstEpisodes(2, horizon=3)
+    episodes.add(after([False, False]))
+    assert not episodes.success.any()
+
+
+def test_what_comes_after_the_first_episode_does_not_count():
+    episodes = FirstEpisodes(2, horizon=3)
+    episodes.add(after([True, False], joint_error=[1.0, 2.0]))
+    for _ in range(2):
+        episodes.add(after([False, False], joint_error=[100.0, 2.0]))
+    assert episodes.values()["joint_error"].tolist() == [1.0, 2.0]
+    assert episodes.success.tolist() == [False, True]
+
+
+def test_metrics_average_over_the_steps_of_each_environment_then_over_environments():
+    episodes = FirstEpisodes(2, horizon=4)
+    for terminated, errors in (
+        ([False, False], [0.2, 1.0]),
+        ([True, False], [0.4, 2.0]),  # the step that terminates belongs to the episode
+        ([False, False], [9.0, 3.0]),
+        ([False, False], [9.0, 4.0]),
+    ):
+        episodes.add(after(terminated, joint_error=errors))
+    assert episodes.values()["joint_error"].tolist() == pytest.approx([0.3, 2.5])
+    assert episodes.summary()["joint_error"] == pytest.approx({"mean": 1.4, "std": 1.1})
+
+
+def test_a_diverged_step_is_not_measured():
+    episodes = FirstEpisodes(2, horizon=2)
+    episodes.add(after([False, True], diverged=[False, True], joint_error=[0.5, float("nan")]))
+    episodes.add(after([False, False], joint_error=[0.5, 0.5]))
+    summary = episodes.summary()
+    assert summary["joint_error"] == {"mean": 0.5, "std": 0.0}
+    assert summary["termination_causes"] == {"diverged": 0.5}
+
+
+def test_contact_rate_is_made_over_intended_where_contact_is_intended():
+    episodes = FirstEpisodes(3, horizon=3)
+    episodes.add(after([False] * 3, contact_made=[0.0, 0.0, 0.0], contact_intended=[0.0, 0.0, 0.0]))
+    episodes.add(after([False] * 3, contact_made=[0.5, 0.0, 0.0], contact_intended=[1.0, 1.0, 0.0]))
+    episodes.add(after([False] * 3, contact_made=[1.0, 0.5, 0.0], contact_intended=[1.0, 1.0, 0.0]))
+    assert episodes.summary()["contact_rate"] == pytest.approx({"mean": 0.5, "std": 0.25})
+
+
+def test_figures_without_measurements_are_null():
+    episodes = FirstEpisodes(1, horizon=1)
+    episodes.add(after([False], contact_made=[0.0], contact_intended=[0.0], joint_error=[0.1]))
+    summary = episodes.summary()
+    assert summary["contact_rate"] is None
+    assert summary["object_pos_error"] is None
+    assert summary["joint_error"] is not None
+
+
+def test_causes_share_out_the_failures_and_the_first_has_precedence():
+    episodes = FirstEpisodes(5, horizon=4, causes=["a", "b"])
+    episodes.add(after([False] * 5, flags={"a": [False] * 5, "b": [False] * 5}))
+    both, b = [True, False, False, False, False], [True, True, False, False, False]
+    episodes.add(after([True, True, False, False, True], flags={"a": both, "b": b}))
+    # flags stay up after the end; they must not count again
+    episodes.add(after([True, True, True, False, True], flags={"a": [True] * 5, "b": b}))
+    episodes.add(after([False] * 5))
+    summary = episodes.summary()
+    assert summary["termination_causes"] == {"diverged": 0.0, "a": 0.4, "b": 0.2, "other": 0.2}
+    assert summary["failure_frames"] == {"diverged": None, "a": 2.5, "b": 2.0, "other": 2.0}
+    assert summary["success_rate"]["mean"] == pytest.approx(1 - 0.8)
+
+
+# -- config ---------------------------------------------------------------------------------------------------
+
+
+def test_the_protocol_starts_at_the_first_frame_and_keeps_what_was_trained():
+    trained = load_config("reset=adaptive")
+    cfg = evaluation_config(trained)
+    assert cfg.reset.state._target_.endswith("ReferenceStateInitialization")
+    assert cfg.reset.state.start == "first"
+    assert cfg.reset.state.noise == trained.reset.state.noise
+    assert "bins" not in cfg.reset.state
+    for group in ("randomization", "noise", "termination", "observation", "action"):
+        assert cfg[group] == trained[group]
+    assert "bins" in trained.reset.state
+
+
+def test_terminations_can_be_chosen():
+    trained = load_config()
+    assert termination_names(evaluation_config(trained)) == termination_names(trained)
+    chosen = evaluation_config(trained, ["object_pose"])
+    assert termination_names(chosen) == ["object_pose"]
+    assert chosen.termination.motion_end is not None
+    assert termination_names(evaluation_config(trained, [])) == []
+    with pytest.raises(ConfigError, match=r"no \['falling'\]; there is \['root_pose'"):
+        evaluation_config(trained, ["falling"])
+
+
+def test_a_start_beyond_the_motion_is_refused():
+    reference = lift_box().reference
+    assert StartAtFrame(reference, 7).sample_frames(torch.Size([3]), None).tolist() == [7, 7, 7]
+    with pytest.raises(ValueError, match="expected a frame from 0 to"):
+        StartAtFrame(reference, reference.num_frames)
+
+
+# -- environments ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def cfg() -> DictConfig:
+    return load_config("algo.actor_hidden=[8]", "algo.critic_hidden=[8]", "algo.bf16=false")
+
+
+@pytest.fixture(scope="module")
+def run(cfg: DictConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with an untrained policy."""
+    env = make_env(cfg, 1, lift_box())
+    spec = env.full_observation_spec
+    sizes = {key: spec[key].shape[-1] for key in ("policy", "critic")} | {"action": env.action_spec.shape[-1]}
+    env.close()
+    torch.manual_seed(0)
+    actor, _ = make_networks(cfg, sizes, torch.device("cpu"))
+    folder = tmp_path_factory.mktemp("run")
+    state = {
+        "config": OmegaConf.to_container(cfg, resolve=True),
+        "sizes": sizes, "actor": actor.state_dict(), "iteration": 3, "frames": 96,
+    }  # fmt: skip
+    save_checkpoint(folder / "checkpoints" / "checkpoint_000003.pt", state)
+    return folder
+
+
+def test_an_evaluation_leaves_its_figures_in_the_run_folder(run: Path):
+    result = evaluate_checkpoint(run, num_envs=2, task="lift_box")
+    assert result.path == run / "eval.json"
+    saved = json.loads((run / "eval.json").read_text())
+    assert saved == dict(result) == dict(EvalResult.load(run / "eval.json"))
+    for name in FIGURES:
+        assert saved[name] is None or set(saved[name]) == {"mean", "std"}, name
+    assert saved["success_rate"]["mean"] + sum(saved["termination_causes"].values()) == pytest.approx(1)
+    # it falls within the motion, and the reasons are the task's
+    assert 0 < saved["survival"]["mean"] < 1
+    assert saved["terminations"] == ["root_pose", "body_local_pose", "object_pose", "lost_contact"]
+    assert set(saved["termination_causes"]) == {"diverged", *saved["terminations"]}
+    expected = {"checkpoint": "checkpoints/checkpoint_000003.pt", "iteration": 3, "frames": 96, "task": "lift_box",
+                "motion": "lift_box", "motion_frames": 300, "num_envs": 2, "seed": 0}  # fmt: skip
+    assert expected.items() <= saved.items()
+    assert result.table().row_count == len(result.figures()) + len(saved["termination_causes"])
+    assert not list(run.glob("*.partial"))
+
+
+def test_without_terminations_the_horizon_is_run_to_its_end(monkeypatch: pytest.MonkeyPatch):
+    seen: list[int] = []
+
+    class Counting(FirstEpisodes):
+        def add(self, after) -> None:
+            seen.append(int(after["step_count"].min()))
+            super().add(after)
+
+    monkeypatch.setattr(protocol, "FirstEpisodes", Counting)
+    short = load_config("task.episode_steps=10", "algo.actor_hidden=[8]")
+    actor = torch.nn.Module()  # zero actions: servos that follow the reference
+    actor.forward = lambda td: td.set("action", torch.zeros(1, 23))  # type: ignore[method-assign]
+    before = torch.get_rng_state()
+    result = evaluate_policy(actor, short, 1, lift_box(), terminations=[])
+    assert torch.equal(torch.get_rng_state(), before)
+    assert seen == list(range(1, 300))
+    assert result["success_rate"]["mean"] == 1.0
+    assert result["terminations"] == []
+
+
+def test_a_checkpoint_of_another_task_is_refused(run: Path):
+    with pytest.raises(CheckpointError, match="'lift_box', not of 'push_box'"):
+        evaluate_checkpoint(run, task="push_box")
+    with pytest.raises(CheckpointError, match="'lift_box', not of 'push_box'"):
+        render_checkpoint(run, task="push_box")
+
+
+# -- videos ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def gl() -> None:
+    """Skips where nothing can be rendered."""
+    try:
+        video._renderer(lift_box().scene.model, (64, 64)).close()
+    except video.RenderingError as error:
+        pytest.skip(str(error))
+
+
+def short(moments: Iterator[video.Moment], count: int = 4) -> Iterator[video.Moment]:
+    for moment, _ in zip(moments, range(count), strict=False):
+        yield moment
+
+
+@pytest.mark.usefixtures("gl")
+@pytest.mark.parametrize("agent", ["zero", "random", "reference"])
+def test_agents_play_into_a_video(
+    agent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    play = script("play")
+    monkeypatch.setattr(play, "every", lambda moments, stride: short(moments))
+    out = tmp_path / "videos" / "play.mp4"
+    status = play.main([f"agent={agent}", f"out={out}", "width=128", "height=96", "start=150"])
+    captured = capsys.readouterr()
+    assert status == 0, captured.err
+    assert captured.out.strip() == str(out)
+    frames = imageio.mimread(out)
+    assert len(frames) == 4
+    assert frames[0].shape == (96, 128, 3)
+    assert frames[0].std() > 10
+    assert [path.name for path in out.parent.iterdir()] == ["play.mp4"]
+
+
+@pytest.mark.usefixtures("gl")
+def test_the_policy_of_a_run_is_rendered_into_its_folder(run: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(video, "every", lambda moments, stride: short(moments, 3))
+    assert render_checkpoint(run, size=(96, 128)) == run / "video.mp4"
+    assert len(imageio.mimread(run / "video.mp4")) == 3
+
+
+def test_play_stops_a_second_after_a_failure(cfg: DictConfig):
+    def lash_out(td):
+        return td.set("action", torch.full((1, 23), 4.0))
+
+    moments = list(video.play_moments(cfg, lift_box(), lash_out))
+    failed = [m.failure for m in moments if m.failure is not None]
+    assert len(failed) == 50
+    assert len(set(failed)) == 1
+    assert [m.frame for m in moments] == list(range(len(moments)))
+
+
+def test_the_reference_replays_from_any_frame():
+    task = lift_box()
+    moments = video.replay(task, 280)
+    first = next(moments)
+    assert first.frame == 280
+    wrist = first.data.body("left_wrist_yaw_link").xpos
+    row = list(task.scene.body_ids).index(first.model.body("left_wrist_yaw_link").id)
+    assert wrist == pytest.approx(task.reference.body_pos[280, row].numpy(), abs=5e-3)
+    assert 1 + sum(1 for _ in moments) == 20
+
+
+def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setattr(sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert script("play").main(["agent=reference", "window=true"]) == 2
+    assert "needs a display" in capsys.readouterr().err
+
+
+# -- options --------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Options:
+    checkpoint: str | None = None
+    num_envs: int = 4
+
+
+def test_options_are_checked():
+    assert parse_options(Options, ["checkpoint=a/b", "num_envs=8"]) == Options("a/b", 8)
+    with pytest.raises(ConfigError, match="unknown option 'envs'; there is checkpoint, num_envs"):
+        parse_options(Options, ["envs=3"])
+    with pytest.raises(ConfigError, match="expected key=value"):
+        parse_options(Options, ["runs/a"])
+    with pytest.raises(ConfigError, match="num_envs"):
+        parse_options(Options, ["num_envs=many"])
+
+
+def test_termination_choices():
+    assert parse_terminations("all") is None
+    assert parse_terminations("none") == []
+    assert parse_terminations(["a", "b"]) == ["a", "b"]
+    assert parse_terminations("a") == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("evaluate", [], "give checkpoint=RUN"),
+        ("evaluate", ["checkpoint=nowhere"], "nowhere"),
+        ("evaluate", ["run=nowhere"], "unknown option 'run'"),
+        ("play", [], "give either checkpoint=RUN or agent="),
+        ("play", ["agent=best"], "there is zero, random, reference"),
+        ("play", ["agent=zero", "task=juggle"], "there is no 'juggle'; there is"),
+        ("play", ["agent=zero", "start=300"], "expected a frame from 0 to 298"),
+        ("play", ["agent=zero", "task=push_box", "motion_root=nowhere"], "not under nowhere"),
+        ("plot_runs", ["nowhere"], "no metrics.csv"),
+    ],
+)
+def test_mistakes_end_scripts_with_one_line(
+    name: str, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+):
+    assert script(name).main(arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.splitlines()) == 1
+
+
+# -- curves ---------------------------------------------------------------------------------------------------
+
+
+def test_runs_are_plotted(tmp_path: Path):
+    header = "iteration,frames,minutes,joint_error,eval/success_rate\n"
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "metrics.csv").write_text(header + "0,100,0.5,0.3,\n1,200,1.0,0.2,0.5\n")
+    out = tmp_path / "pictures" / "curves.png"
+    assert script("plot_runs").main([str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(out)]) == 0
+    image = imageio.imread(out)
+    assert image.shape[1] > 600
+    assert image[..., :3].std() > 5

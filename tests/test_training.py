@@ -1,0 +1,212 @@
+"""Training end to end on tiny budgets: it runs, resumes exactly, and survives what goes wrong."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from hdmi.learning import CheckpointError, RunningNorm, Trainer, load_checkpoint, load_policy, save_checkpoint
+from hdmi.learning.checkpoint import checkpoints
+from hdmi.learning.trainer import DivergenceError
+
+ROOT = Path(__file__).parents[1]
+TINY = [
+    "num_envs=4", "algo.frames_per_env=8", "algo.minibatches=2", "algo.epochs=2", "total_frames=128",
+    "algo.actor_hidden=[32]", "algo.critic_hidden=[32]", "algo.bf16=false", "checkpoint_interval=2",
+    "logger=csv", "video=false", "num_threads=1", "eval_envs=2",
+]  # fmt: skip
+
+
+def config(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("config", overrides=[*TINY, *overrides])
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Trainer, Path]:
+    folder = tmp_path_factory.mktemp("run")
+    trainer = Trainer(config(), folder)
+    trainer.run()
+    return trainer, folder
+
+
+class TestRun:
+    def test_leaves_config_metrics_and_rotated_checkpoints(self, trained: tuple[Trainer, Path]) -> None:
+        _, folder = trained
+        rows = list(csv.DictReader((folder / "metrics.csv").open()))
+        assert [int(row["iteration"]) for row in rows] == [1, 2, 3, 4]
+        assert [int(row["frames"]) for row in rows] == [32, 64, 96, 128]
+        for key in ("reward", "reward/interaction", "joint_error", "contact_rate", "termination/root_pose", "kl"):
+            assert all(row[key] for row in rows), key
+        assert (folder / "config.yaml").is_file()
+        assert [path.name for path in checkpoints(folder / "checkpoints")] == [
+            "checkpoint_000002.pt",
+            "checkpoint_000004.pt",
+        ]
+
+    def test_weights_and_moments_moved(self, trained: tuple[Trainer, Path]) -> None:
+        trainer, _ = trained
+        fresh = Trainer(config(), Path("unused"))
+        moved = [
+            not torch.equal(a, b) for a, b in zip(trainer.actor.parameters(), fresh.actor.parameters(), strict=True)
+        ]
+        assert all(moved)
+
+    def test_policy_loads_and_repeats(self, trained: tuple[Trainer, Path]) -> None:
+        trainer, folder = trained
+        actor, cfg, info = load_policy(folder)
+        assert cfg.task.name == "lift_box"
+        assert info["frames"] == 128
+        observation = torch.randn(3, trainer.sizes["policy"])
+        expected = trainer.actor.module[0].module(observation)[0]
+        torch.testing.assert_close(actor.module[0].module(observation)[0], expected)
+
+
+class TestResume:
+    def test_continues_exactly(self, trained: tuple[Trainer, Path], tmp_path: Path) -> None:
+        straight, _ = trained
+        first = Trainer(config("total_frames=64"), tmp_path)
+        first.run()
+        second = Trainer(config(f"resume={tmp_path}"), tmp_path)
+        assert second.iteration == 2
+        second.run()
+        for a, b in zip(straight.actor.parameters(), second.actor.parameters(), strict=True):
+            torch.testing.assert_close(a, b, rtol=0, atol=0)
+        rows = list(csv.DictReader((tmp_path / "metrics.csv").open()))
+        assert [int(row["iteration"]) for row in rows] == [1, 2, 3, 4]
+
+    def test_after_kill_9(self, tmp_path: Path) -> None:
+        command = [
+            sys.executable, str(ROOT / "train.py"), *TINY, "checkpoint_interval=1", "total_frames=1000000",
+            f"output_dir={tmp_path}", "run_name=run",
+        ]  # fmt: skip
+        process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        folder = tmp_path / "run" / "checkpoints"
+        deadline = time.monotonic() + 120
+        while len(checkpoints(folder)) < 2 and time.monotonic() < deadline:
+            assert process.poll() is None, "training ended by itself"
+            time.sleep(0.1)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        state = load_checkpoint(tmp_path / "run")
+        resumed = Trainer(config(f"resume={tmp_path / 'run'}"), tmp_path / "run")
+        assert resumed.iteration == state["iteration"] >= 2
+
+    def test_refuses_another_task(self, trained: tuple[Trainer, Path], tmp_path: Path) -> None:
+        _, folder = trained
+        state = load_checkpoint(folder)
+        state["task"] = "push_box"
+        save_checkpoint(tmp_path / "checkpoints" / "checkpoint_000001.pt", state)
+        with pytest.raises(CheckpointError, match=r"'push_box'.*'lift_box'"):
+            Trainer(config(f"resume={tmp_path}"), tmp_path)
+
+
+class TestCheckpoint:
+    def test_missing_damaged_and_foreign(self, tmp_path: Path) -> None:
+        with pytest.raises(CheckpointError, match="no checkpoint"):
+            load_checkpoint(tmp_path)
+        path = tmp_path / "checkpoint_000001.pt"
+        path.write_bytes(b"not a checkpoint")
+        with pytest.raises(CheckpointError, match="checkpoint_000001.pt"):
+            load_checkpoint(tmp_path)
+        torch.save({"something": torch.zeros(1)}, path)
+        with pytest.raises(CheckpointError, match="format"):
+            load_checkpoint(path)
+
+    def test_never_unpickles_code(self, tmp_path: Path) -> None:
+        class Hostile:
+            def __reduce__(self) -> tuple:
+                return (Path.touch, (tmp_path / "executed",))
+
+        torch.save({"format": 1, "x": Hostile()}, tmp_path / "checkpoint_000001.pt")
+        with pytest.raises(CheckpointError):
+            load_checkpoint(tmp_path)
+        assert not (tmp_path / "executed").exists()
+
+    def test_failed_write_keeps_what_was_there(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        path = tmp_path / "checkpoint_000001.pt"
+        save_checkpoint(path, {"value": 1})
+
+        def full_disk(*args: object, **kwargs: object) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(torch, "save", full_disk)
+        with pytest.raises(OSError, match="No space left"):
+            save_checkpoint(path, {"value": 2})
+        monkeypatch.undo()
+        assert load_checkpoint(path)["value"] == 1
+        assert list(tmp_path.iterdir()) == [path]
+
+
+class TestRecovery:
+    def test_full_disk_does_not_stop_training(
+        self, trained: tuple[Trainer, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    ) -> None:
+        trainer, _ = trained
+
+        def full_disk(*args: object, **kwargs: object) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(torch, "save", full_disk)
+        lost = trainer.lost_checkpoints
+        trainer.save()
+        assert trainer.lost_checkpoints == lost + 1
+        assert "No space left" in capsys.readouterr().err
+
+    def test_bad_minibatch_is_skipped_and_many_stop(self, trained: tuple[Trainer, Path]) -> None:
+        trainer, _ = trained
+        torch.manual_seed(0)
+        batch = trainer.env.rollout(4, trainer.actor, break_when_any_done=False)
+        with torch.no_grad():
+            trainer.gae(batch)
+        data = batch.reshape(-1).select(
+            "policy", "critic", "action", "action_log_prob", "advantage", "value_target", "state_value"
+        )
+        data["advantage"].fill_(float("nan"))
+        before = [p.clone() for p in trainer.actor.parameters()]
+        assert trainer._step(data) is None
+        assert all(torch.equal(a, b) for a, b in zip(before, trainer.actor.parameters(), strict=True))
+        with pytest.raises(DivergenceError, match="without finite loss"):
+            for _ in range(100):
+                trainer._step(data)
+
+
+def test_running_norm_matches_moments_of_all_batches() -> None:
+    torch.manual_seed(0)
+    norm = RunningNorm(3)
+    batches = [torch.randn(50, 3) * 2 + 1, torch.randn(20, 3) - 4, torch.randn(7, 2, 3)]
+    for batch in batches:
+        norm.update(batch)
+    everything = torch.cat([batch.reshape(-1, 3) for batch in batches])
+    torch.testing.assert_close(norm.mean, everything.mean(0), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(norm.var, everything.var(0, unbiased=False), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        (["task.motion=nowhere"], "MotionError.*nowhere"),
+        (["reward.interaction.sigma=1"], "ConfigError.*reward.interaction"),
+        (["robot.feet=wheels"], "ConfigError.*feet"),
+        (["resume=/nonexistent"], "CheckpointError.*/nonexistent"),
+    ],
+)
+def test_bad_input_is_one_clear_error(overrides: list[str], expected: str, tmp_path: Path) -> None:
+    overrides = [f"+{o}" if o.startswith("reward") else o for o in overrides]
+    command = [sys.executable, str(ROOT / "train.py"), *TINY, *overrides, f"output_dir={tmp_path}"]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)
+    assert result.returncode == 2
+    text = " ".join(result.stdout.split())
+    assert re.search(expected, text), result.stdout + result.stderr
+    assert "Traceback" not in result.stdout + result.stderr
