@@ -11,7 +11,7 @@ import torch
 from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
-from torchrl.envs import CatTensors, Compose, SelectTransform, Transform, TransformedEnv
+from torchrl.envs import CatTensors, Compose, RemoveEmptySpecs, SelectTransform, Transform, TransformedEnv
 
 from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene
 from hdmi.envs import BatchBackend, HumanoidObjectEnv
@@ -143,6 +143,7 @@ def make_env(
     state = set(env.full_state_spec.keys(True, True))
     entries = list(env.full_observation_spec.keys(True, True))
     env.append_transform(SelectTransform(*(key for key in entries if key in state or _top(key) in OUTPUTS)))
+    env.append_transform(RemoveEmptySpecs())
     return env
 
 

@@ -21,7 +21,8 @@ USER_ERRORS = (ConfigError, MotionError, CheckpointError, DivergenceError, FileN
 
 def main(cfg: DictConfig) -> None:
     """Runs one training from a config; leaves checkpoints, metrics.csv, eval.json and a video in its run folder."""
-    console = Console()
+    # tables keep their columns in log files
+    console = Console() if sys.stdout.isatty() else Console(width=150)
     try:
         folder = run_folder(cfg)
         trainer = Trainer(cfg, folder)
@@ -47,12 +48,15 @@ def main(cfg: DictConfig) -> None:
 
 def finish(cfg: DictConfig, folder: Path, console: Console) -> None:
     """Evaluates the trained policy and renders it."""
-    from hdmi.evaluation import evaluate_checkpoint, render_checkpoint
+    from hdmi.evaluation import RenderingError, evaluate_checkpoint, render_checkpoint
 
     result = evaluate_checkpoint(folder, num_envs=cfg.eval_envs)
     console.print(result.table())
     if cfg.video:
-        console.print(f"video: {render_checkpoint(folder)}", soft_wrap=True)
+        try:
+            console.print(f"video: {render_checkpoint(folder)}", soft_wrap=True)
+        except (RenderingError, OSError) as error:
+            console.print(f"no video: {error}", soft_wrap=True)
 
 
 def run_folder(cfg: DictConfig) -> Path:

@@ -62,7 +62,10 @@ class WorldRenderer:
             self._size = (height, width)
         pelvis = data.body("pelvis").xpos
         self._camera.lookat[:] = [pelvis[0], pelvis[1], 0.75]
-        self._renderer.update_scene(data, self._camera, self._option)
+        # of the model that is given, not the one that the renderer was made with: worlds differ in size
+        catmask = int(mujoco.mjtCatBit.mjCAT_ALL)
+        mujoco.mjv_updateScene(model, data, self._option, None, self._camera, catmask, self._renderer.scene)
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         if draw is not None:
             draw(self._renderer.scene)
         return self._renderer.render().copy()

@@ -54,13 +54,17 @@ class StartAtFrame(ReferenceStateInitialization):
     """Starts all episodes from one frame of the reference, perturbed.
 
     Args:
-        frame: of the reference. noise: as in `ReferenceStateInitialization`.
+        frame: of the reference. noise, held_noise: as in `ReferenceStateInitialization`.
     """
 
     def __init__(
-        self, reference: Reference, frame: int, noise: Mapping[str, float | Sequence[float]] | None = None
-    ) -> None:
-        super().__init__(reference, "first", 1, noise)
+        self,
+        reference: Reference,
+        frame: int,
+        noise: Mapping[str, float | Sequence[float]] | None = None,
+        held_noise: float = 1.0,
+    ):
+        super().__init__(reference, "first", 1, noise, held_noise)
         if not 0 <= frame < reference.num_frames - 1:
             raise ValueError(f"start: expected a frame from 0 to {reference.num_frames - 2}, got {frame}")
         self.frame = frame

@@ -276,7 +276,8 @@ class Trainer:
         carrier = TensorDict(state["carrier"], batch_size=[len(state["carrier"]["done"])])
         if carrier.batch_size[0] != self.cfg.num_envs:
             raise CheckpointError(
-                f"resume: the checkpoint has {carrier.batch_size[0]} environments, the config num_envs={self.cfg.num_envs}"
+                f"resume: the checkpoint has {carrier.batch_size[0]} environments, "
+                f"the config num_envs={self.cfg.num_envs}"
             )
         self.env.base_env.set_state(TensorDict(state["env"]))
         self.env.base_env.num_diverged = state["num_diverged"]
@@ -299,7 +300,8 @@ def summarize(batch: TensorDictBase) -> dict[str, float]:
         if "contact_made" in means:
             row["contact_rate"] = means.pop("contact_made") / max(means.pop("contact_intended"), 1e-6)
         row |= means
-    for name, value in after["termination"].items():
+    causes = after.get("termination", None)
+    for name, value in () if causes is None else causes.items():
         row[f"termination/{name}"] = float((value & done).sum()) / ended
     row["episode_completed"] = float(after["completed"].sum()) / ended
     row["episodes"] = int(done.sum())

@@ -184,7 +184,8 @@ def _contacts(motion: Motion, effectors: Sequence[Effector]) -> tuple[np.ndarray
     if motion.contact_points is not None:
         if motion.contact_points.shape[1] != count:
             raise MotionError(
-                f"motion {motion.name!r}: contact_points has {motion.contact_points.shape[1]} effectors, the task {count}"
+                f"motion {motion.name!r}: contact_points has {motion.contact_points.shape[1]} effectors, "
+                f"the task {count}"
             )
         points = motion.contact_points
     return contact, points

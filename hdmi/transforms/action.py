@@ -98,7 +98,10 @@ class JointPositionAction(_ActionTransform):
 
 
 class ResidualAction(_ActionTransform):
-    """Residual action space: target = theta_ref + a (section III-B-2). Reads `base_key` [..., J] of the present step."""
+    """Residual action space: target = theta_ref + a (section III-B-2).
+
+    Reads `base_key` [..., J] of the present step, rad.
+    """
 
     def __init__(self, base_key: NestedKey = ("ref", "joint_pos"), action_key: NestedKey = "action"):
         super().__init__(action_key, [base_key])

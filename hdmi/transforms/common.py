@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -24,6 +26,17 @@ def add_keys(spec: Composite, values: TensorDictBase, keys: Sequence[NestedKey])
     for key in keys:
         spec[unravel_key(key)] = spec_like(values.get(key))
     return spec
+
+
+def without_drawing(method: Callable[[Any, Composite], Composite]) -> Callable[[Any, Composite], Composite]:
+    """Keeps torch's random state: specs are computed at first use, which must not move a seeded run."""
+
+    @wraps(method)
+    def wrapped(self: Any, spec: Composite) -> Composite:
+        with torch.random.fork_rng():
+            return method(self, spec)
+
+    return wrapped
 
 
 class SpecTransform(Transform):
@@ -59,10 +72,15 @@ class FunctionTransform(SpecTransform):
         raise NotImplementedError
 
     def _call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        outputs = self.function(*(tensordict.get(key) for key in self.in_keys))
+        # functions see one batch dimension, whatever the batch
+        batch = tensordict.batch_size
+        inputs = [tensordict.get(key) for key in self.in_keys]
+        if len(batch) != 1:
+            inputs = [value.reshape(-1, *value.shape[len(batch) :]) for value in inputs]
+        outputs = self.function(*inputs)
         outputs = (outputs,) if isinstance(outputs, Tensor) else outputs
         for key, value in zip(self.out_keys, outputs, strict=True):
-            tensordict.set(key, value)
+            tensordict.set(key, value if len(batch) == 1 else value.reshape(*batch, *value.shape[1:]))
         return tensordict
 
     forward = _call
@@ -70,6 +88,7 @@ class FunctionTransform(SpecTransform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)
 
+    @without_drawing
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         inputs = TensorDict({}, batch_size=observation_spec.shape, device=observation_spec.device)
         for key in self.in_keys:
@@ -99,11 +118,13 @@ class StateTransform(SpecTransform):
             tensordict_reset.set(key, value)
         return tensordict_reset
 
+    @without_drawing
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         for key, value in self.initial_state(observation_spec.shape, observation_spec.device).items():
             observation_spec[unravel_key(key)] = spec_like(value)
         return observation_spec
 
+    @without_drawing
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         input_spec = super().transform_input_spec(input_spec)
         state = self.initial_state(input_spec.shape, input_spec.device)
@@ -126,5 +147,6 @@ def add_state_specs(input_spec: Composite, specs: Mapping[NestedKey, TensorSpec]
 
 def set_terminated(next_tensordict: TensorDictBase, flag: Tensor, key: str = "terminated") -> None:
     """Raises `terminated` (or `truncated`) where `flag`, and `done` with it: `any_done` reads only `done`."""
-    next_tensordict.set(key, next_tensordict.get(key) | flag)
+    present = next_tensordict.get(key, None)
+    next_tensordict.set(key, flag if present is None else present | flag)
     next_tensordict.set("done", next_tensordict.get("done") | flag)

@@ -18,7 +18,7 @@ from hdmi.functional import (
     quat_multiply,
     quat_to_rot6d,
 )
-from hdmi.transforms.common import FunctionTransform, SpecTransform, add_state_specs, spec_like
+from hdmi.transforms.common import FunctionTransform, SpecTransform, add_state_specs, spec_like, without_drawing
 
 _ROOT_POS: NestedKey = ("robot", "root_pos")
 _ROOT_QUAT: NestedKey = ("robot", "root_quat")
@@ -182,6 +182,7 @@ class _EntryState(SpecTransform):
         tensordict.set(self.state_key, state)
         return tensordict
 
+    @without_drawing
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         value = observation_spec[self.in_keys[0]].zero()
         self._features = value.shape[len(observation_spec.shape) :]
@@ -190,6 +191,7 @@ class _EntryState(SpecTransform):
         observation_spec[self.state_key] = spec_like(state)
         return observation_spec
 
+    @without_drawing
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         input_spec = super().transform_input_spec(input_spec)
         if self._features is None and self.parent is not None:

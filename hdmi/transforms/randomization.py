@@ -36,7 +36,8 @@ class ModelRandomization(SpecTransform):
         if per not in ("episode", "world"):
             raise ValueError(f"{type(self).__name__}: per is 'episode' or 'world', got {per!r}")
         self.per = per
-        self._drawn = False
+        # of the numbers per world; -1 until the first reset. A buffer, so that a resumed run keeps its worlds.
+        self.register_buffer("seed", torch.tensor(-1))
 
     def draw(self, init: TensorDictBase) -> None:
         """Writes into `init` (batch [N]) what this term randomizes."""
@@ -45,13 +46,18 @@ class ModelRandomization(SpecTransform):
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         if tensordict is None:
             tensordict = TensorDict({}, batch_size=self.parent.batch_size, device=self.parent.device)
-        if self.per == "world" and self._drawn:
-            return tensordict
-        self._drawn = True
         init = tensordict.get("init", None)
         if init is None:
             init = TensorDict({}, batch_size=tensordict.batch_size, device=tensordict.device)
-        self.draw(init)
+        if self.per == "world":
+            # the same numbers again: terms per episode build on the rows that this one writes
+            if self.seed < 0:
+                self.seed.copy_(torch.randint(2**31, ()))
+            with torch.random.fork_rng():
+                torch.manual_seed(int(self.seed))
+                self.draw(init)
+        else:
+            self.draw(init)
         tensordict.set("init", init)
         return tensordict
 
@@ -205,7 +211,7 @@ class JointOffset(_ActionStateTransform):
         if action is not None:
             offset = tensordict.get("joint_offset")
             # targets may come one per physics step [N, S, J]
-            tensordict.set(self.action_key, action + (offset if action.ndim == 2 else offset.unsqueeze(-2)))
+            tensordict.set(self.action_key, action + (offset if action.ndim == offset.ndim else offset.unsqueeze(-2)))
         return tensordict
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

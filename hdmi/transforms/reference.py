@@ -142,6 +142,7 @@ class ReferenceStateInitialization(SpecTransform):
         reference: where to start from.
         start: `uniform` over all frames but the last `margin`, or `first`.
         margin: frames at the end that no episode starts from.
+        first_share: share of episodes that start at the first frame all the same, as evaluations do.
         noise: half ranges of uniform perturbations: root_pos [3] m, root_rpy [3] rad, root_lin_vel, root_ang_vel,
             joint_pos (rad), joint_vel; object_pos [3], object_rpy [3], object_joint (rad). Absent means none.
         held_noise: factor of the object's perturbations at frames where contact is intended: an object between two
@@ -160,6 +161,7 @@ class ReferenceStateInitialization(SpecTransform):
         margin: int = 1,
         noise: Mapping[str, float | Sequence[float]] | None = None,
         held_noise: float = 1.0,
+        first_share: float = 0.0,
     ):
         super().__init__()
         if start not in ("uniform", "first"):
@@ -167,7 +169,7 @@ class ReferenceStateInitialization(SpecTransform):
         unknown = set(noise or {}) - set(self._NOISES)
         if unknown:
             raise ValueError(f"reset.noise: unknown {sorted(unknown)}; there is {list(self._NOISES)}")
-        self.start = start
+        self.start, self.first_share = start, first_share
         self.num_starts = max(reference.num_frames - margin, 1)
         self.reference = reference
         held = reference.contact.any(-1, keepdim=True)  # [T, 1]
@@ -182,11 +184,15 @@ class ReferenceStateInitialization(SpecTransform):
             return torch.zeros(batch_size, dtype=torch.int64, device=device)
         return torch.randint(self.num_starts, tuple(batch_size), device=device)
 
+    def _start_frames(self, batch_size: torch.Size, device: torch.device | None) -> Tensor:
+        frames = self.sample_frames(batch_size, device)
+        return frames * (torch.rand(tuple(batch_size), device=device) >= self.first_share)
+
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         if tensordict is None:
             tensordict = TensorDict({}, batch_size=self.parent.batch_size, device=self.parent.device)
         batch_size, device = tensordict.batch_size, tensordict.device
-        frames = self.sample_frames(batch_size, device)
+        frames = self._start_frames(batch_size, device)
         tensordict.set(FRAME_KEY, frames.unsqueeze(-1))
         for key, value in self.initial_state(frames).items():
             tensordict.set(("init", key), value)
@@ -244,12 +250,13 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
         margin: int = 1,
         noise: Mapping[str, float | Sequence[float]] | None = None,
         held_noise: float = 1.0,
+        first_share: float = 0.0,
         bins: int = 20,
         uniform_share: float = 0.5,
         decay: float = 0.999,
         lead: int = 25,
     ):
-        super().__init__(reference, start, margin, noise, held_noise)
+        super().__init__(reference, start, margin, noise, held_noise, first_share)
         self.uniform_share, self.decay, self.lead = uniform_share, decay, lead
         self.register_buffer("failures", torch.zeros(bins))
 
@@ -291,7 +298,13 @@ class MotionEnd(SpecTransform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         done = tensordict_reset.get("done")
         tensordict_reset.set("completed", torch.zeros_like(done))
+        tensordict_reset.set("truncated", torch.zeros_like(done))
         return tensordict_reset
+
+    def transform_done_spec(self, done_spec: Composite) -> Composite:
+        if "truncated" not in done_spec.keys():
+            done_spec["truncated"] = done_spec["done"].clone()
+        return done_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         flag = torch.zeros(*observation_spec.shape, 1, dtype=torch.bool, device=observation_spec.device)

@@ -47,8 +47,8 @@ class RewardTerm(SpecTransform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Recomputes the term on recorded transitions, in their `next`."""
-        tensordict.set("next", self._step(tensordict, tensordict.get("next")))
-        return tensordict
+        # shallow copies: a replay buffer may hand out what it stores
+        return tensordict.copy().set("next", self._step(tensordict, tensordict.get("next").copy()))
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
         reward_spec[self.out_keys[0]] = reward_spec[self.reward_key].clone()
