@@ -53,8 +53,7 @@ def build(node: Any, where: str, **context: Any) -> Any:
     Raises:
         ConfigError: for an unknown class or parameter, or values that the class refuses; names the node.
     """
-    values = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else dict(node)
-    assert isinstance(values, dict)
+    values: dict[str, Any] = _container(node) if OmegaConf.is_config(node) else dict(node)
     path = values.pop("_target_", None)
     if path is None:
         raise ConfigError(f"{where}: has no _target_")
@@ -83,9 +82,13 @@ def _plain(value: Any, where: str) -> Any:
     return value
 
 
+def _container(node: Any) -> dict[str, Any]:
+    values: Any = OmegaConf.to_container(node, resolve=True)
+    return values
+
+
 def _dataclass(cls: type, node: Any, where: str) -> Any:
-    values = OmegaConf.to_container(node, resolve=True)
-    assert isinstance(values, dict)
+    values = _container(node)
     names = {f.name for f in fields(cls)}
     if unknown := set(values) - names:
         raise ConfigError(f"{where}: unknown {sorted(map(str, unknown))}; there is {sorted(names)}")

@@ -491,6 +491,9 @@ DAMPING_RATIO = 2.0
 
 BODY_NAMES: tuple[str, ...] = tuple(body.name for body in BODIES)
 JOINT_NAMES: tuple[str, ...] = tuple(joint.name for joint in JOINTS)
+JOINT_RANGES: tuple[Vec, ...] = tuple(joint.range for joint in JOINTS)
+EFFORT_LIMITS: Vec = tuple(joint.effort_limit for joint in JOINTS)
+TOTAL_MASS = sum(body.mass for body in BODIES)  # kg
 
 
 def servo_gains(armature: float) -> tuple[float, float]:

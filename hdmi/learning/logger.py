@@ -77,6 +77,6 @@ def _start_wandb(folder: Path, cfg: DictConfig) -> Any:
         mode=cfg.logger.wandb.mode,
         dir=folder,
         name=folder.name,
-        config=OmegaConf.to_container(cfg, resolve=True),
+        config=dict(OmegaConf.to_container(cfg, resolve=True)),  # type: ignore[arg-type]
         settings=wandb.Settings(silent=True, console="off"),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -61,22 +62,33 @@ class _Network(nn.Module):
             nn.init.orthogonal_(layer.weight, gain if layer is layers[-1] else 2**0.5)
             nn.init.zeros_(layer.bias)
 
-    def forward(self, observation: Tensor) -> Tensor:
+    def evaluate(self, observation: Tensor) -> Tensor:
+        """The MLP's output for raw observations. [..., in_size] -> [..., out_size]"""
         normalised = self.norm(observation)
         with torch.autocast(observation.device.type, dtype=torch.bfloat16, enabled=self.bf16):
             out = self.mlp(normalised)
         return out.float()
 
 
+class _ValueHead(_Network):
+    """State value."""
+
+    def __init__(self, in_size: int, **kwargs: Any):
+        super().__init__(in_size, 1, gain=1.0, **kwargs)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return self.evaluate(observation)
+
+
 class _GaussianHead(_Network):
     """Mean from the network, standard deviation a free parameter per action."""
 
-    def __init__(self, in_size: int, out_size: int, init_noise: float, **kwargs):
+    def __init__(self, in_size: int, out_size: int, init_noise: float, **kwargs: Any):
         super().__init__(in_size, out_size, gain=0.01, **kwargs)
         self.log_std = nn.Parameter(torch.full((out_size,), init_noise).log())
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        loc = super().forward(observation)
+        loc = self.evaluate(observation)
         return loc, self.log_std.exp().clamp(_MIN_STD, _MAX_STD).expand_as(loc)
 
 
@@ -95,7 +107,7 @@ def make_actor(
 
 def make_critic(in_size: int, hidden: Sequence[int], activation: str, bf16: bool) -> ValueOperator:
     """State value from privileged observations: `critic` [..., in_size] -> `state_value` [..., 1]."""
-    return ValueOperator(_Network(in_size, 1, hidden, activation, bf16, gain=1.0), in_keys=["critic"])
+    return ValueOperator(_ValueHead(in_size, hidden=hidden, activation=activation, bf16=bf16), in_keys=["critic"])
 
 
 def observation_norm(module: nn.Module) -> RunningNorm:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,8 +55,9 @@ class Reference:
 
     def to(self, device: torch.device | str) -> Reference:
         """The same reference on another device."""
-        moved = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{k: v.to(device) for k, v in moved.items() if isinstance(v, Tensor)})
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        moved: dict[str, Any] = {k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)}
+        return replace(self, **moved)
 
 
 def find_motion(name: str, motion_root: str | None = None) -> Path:
@@ -212,14 +214,15 @@ def resample(motion: Motion, fps: float) -> Motion:
         axis=1,
     ).astype(np.float32)
     nearest = np.abs(new[:, None] - old[None]).argmin(1)
+    sampled: dict[str, Any] = {
+        key: linear(getattr(motion, key))
+        for key in ("body_pos_w", "body_lin_vel_w", "body_ang_vel_w", "joint_pos", "joint_vel")
+    }
     return replace(
         motion,
         fps=fps,
         body_quat_w=quat,
         object_contact=None if motion.object_contact is None else motion.object_contact[nearest],
         contact_points=None if motion.contact_points is None else linear(motion.contact_points),
-        **{
-            k: linear(getattr(motion, k))
-            for k in ("body_pos_w", "body_lin_vel_w", "body_ang_vel_w", "joint_pos", "joint_vel")
-        },
+        **sampled,
     )

@@ -20,7 +20,9 @@ from hdmi.transforms.action import _ActionStateTransform
 from hdmi.transforms.common import SpecTransform
 
 
-def _between(low: float, high: float, shape: Sequence[int], device: torch.device | None) -> Tensor:
+def _between(span: Sequence[float], shape: Sequence[int], device: torch.device | None) -> Tensor:
+    """Uniform between the two figures of `span`."""
+    low, high = span
     return low + (high - low) * torch.rand(tuple(shape), device=device)
 
 
@@ -99,10 +101,10 @@ class MassRandomization(ModelRandomization):
     def draw(self, init: TensorDictBase) -> None:
         n = init.batch_size[0]
         if self.mass is not None:
-            factor = (_between(*self.mass, (n, 1), init.device) / self.total).expand(n, len(self.bodies))
+            factor = (_between(self.mass, (n, 1), init.device) / self.total).expand(n, len(self.bodies))
         else:
             assert self.scale is not None
-            factor = _between(*self.scale, (n, len(self.bodies)), init.device)
+            factor = _between(self.scale, (n, len(self.bodies)), init.device)
         for field, shaped in (("body_mass", factor), ("body_inertia", factor.unsqueeze(-1))):
             rows = _rows(init, self.model, field)
             rows[:, self.bodies] *= shaped
@@ -127,7 +129,7 @@ class CenterOfMassRandomization(ModelRandomization):
     def draw(self, init: TensorDictBase) -> None:
         rows = _rows(init, self.model, "body_ipos")
         shape = (init.batch_size[0], len(self.bodies), 3)
-        rows[:, self.bodies] += _between(-self.shift, self.shift, shape, init.device)
+        rows[:, self.bodies] += _between((-self.shift, self.shift), shape, init.device)
         init.set(("model", "body_ipos"), rows)
 
 
@@ -152,7 +154,7 @@ class FrictionRandomization(ModelRandomization):
 
     def draw(self, init: TensorDictBase) -> None:
         rows = _rows(init, self.model, "geom_friction")
-        rows[:, self.geoms, 0] = _between(*self.friction, (init.batch_size[0], 1), init.device)
+        rows[:, self.geoms, 0] = _between(self.friction, (init.batch_size[0], 1), init.device)
         init.set(("model", "geom_friction"), rows)
 
 
@@ -164,7 +166,7 @@ class ObjectScale(ModelRandomization):
         self.range = scale
 
     def draw(self, init: TensorDictBase) -> None:
-        init.set("object_scale", _between(*self.range, (init.batch_size[0], 1), init.device))
+        init.set("object_scale", _between(self.range, (init.batch_size[0], 1), init.device))
 
 
 class ObjectJointRandomization(ModelRandomization):
@@ -186,7 +188,7 @@ class ObjectJointRandomization(ModelRandomization):
     def draw(self, init: TensorDictBase) -> None:
         for field, span in self.ranges.items():
             rows = _rows(init, self.model, field)
-            rows[:, self.dof] = _between(*span, (init.batch_size[0],), init.device)
+            rows[:, self.dof] = _between(span, (init.batch_size[0],), init.device)
             init.set(("model", field), rows)
 
 
@@ -204,7 +206,7 @@ class JointOffset(_ActionStateTransform):
         self.offset, self.size = offset, size
 
     def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
-        return {"joint_offset": _between(-self.offset, self.offset, (*batch_size, self.size), device)}
+        return {"joint_offset": _between((-self.offset, self.offset), (*batch_size, self.size), device)}
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get(self.action_key, None)

@@ -302,7 +302,7 @@ class MotionEnd(SpecTransform):
         return tensordict_reset
 
     def transform_done_spec(self, done_spec: Composite) -> Composite:
-        if "truncated" not in done_spec.keys():
+        if "truncated" not in set(done_spec.keys()):
             done_spec["truncated"] = done_spec["done"].clone()
         return done_spec
 

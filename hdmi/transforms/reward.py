@@ -165,7 +165,7 @@ class JointPosLimitsL1(RewardTerm):
         weight: float = -10.0,
         soft_limit: float = 0.95,
         joint_pos_key: NestedKey = ("robot", "joint_pos"),
-        limits: Sequence[Sequence[float]] = tuple(joint.range for joint in g1.JOINTS),
+        limits: Sequence[Sequence[float]] = g1.JOINT_RANGES,
         reward_key: NestedKey = "reward",
     ):
         super().__init__(name, [joint_pos_key], weight, reward_key)
@@ -187,7 +187,7 @@ class JointTorqueLimitsL1(RewardTerm):
         weight: float = -0.01,
         soft_limit: float = 0.9,
         joint_torque_key: NestedKey = ("robot", "joint_torque"),
-        limits: Sequence[float] = tuple(joint.effort_limit for joint in g1.JOINTS),
+        limits: Sequence[float] = g1.EFFORT_LIMITS,
         reward_key: NestedKey = "reward",
     ):
         super().__init__(name, [joint_torque_key], weight, reward_key)
@@ -220,7 +220,7 @@ class FeetImpactL2(RewardTerm):
         self,
         name: str = "feet_impact",
         weight: float = -1.0,
-        weight_force: float = 9.81 * sum(body.mass for body in g1.BODIES),
+        weight_force: float = 9.81 * g1.TOTAL_MASS,
         force_key: NestedKey = ("feet", "force"),
         previous_key: NestedKey = ("feet", "previous_force"),
         reward_key: NestedKey = "reward",
