@@ -37,7 +37,7 @@ LIFT = (1.6, 2.5, 3.5, 4.4)
 BOX_X = 0.32  # of box and stand, ahead of the ankles, m
 LIFT_HEIGHT = 0.15  # m
 CLEARANCE = 0.05  # between palm and box before the palms close in, m
-SQUEEZE = 0.04  # how far inside the box's sides the palms are while they hold it, m
+SQUEEZE = 0.045  # how far inside the box's sides the palms are while they hold it, m
 HAND_PITCH = 0.1  # fingers down while at the box, rad
 
 FOOT_Y = 0.119  # m
