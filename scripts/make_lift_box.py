@@ -119,7 +119,7 @@ class Solver:
                 self.configuration, tasks, 1.0, "daqp", damping=1e-4, limits=self.limits, constraints=self.feet
             )
             self.configuration.integrate_inplace(velocity, 1.0)
-            if np.abs(velocity).max() < 2e-5:
+            if np.abs(velocity).max() < 1e-4:
                 return self.configuration.q.copy()
         raise RuntimeError(f"inverse kinematics does not settle: last step {np.abs(velocity).max():.1e} rad")
 

@@ -88,6 +88,7 @@ class Trainer:
             trust_policy=True,
             return_same_td=True,
             track_traj_ids=False,
+            auto_register_policy_transforms=False,  # nothing in the policy is recurrent
         )
         if cfg.resume is not None:
             self.restore(load_checkpoint(cfg.resume, self.device))
