@@ -55,9 +55,8 @@ class TestRun:
             "checkpoint_000004.pt",
         ]
 
-    def test_weights_and_moments_moved(self, trained: tuple[Trainer, Path]) -> None:
+    def test_weights_moved(self, trained: tuple[Trainer, Path], fresh: Trainer) -> None:
         trainer, _ = trained
-        fresh = Trainer(config(), Path("unused"))
         moved = [
             not torch.equal(a, b) for a, b in zip(trainer.actor.parameters(), fresh.actor.parameters(), strict=True)
         ]
@@ -149,11 +148,16 @@ class TestCheckpoint:
         assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.fixture(scope="module")
+def fresh(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
+    return Trainer(config(), tmp_path_factory.mktemp("fresh"))
+
+
 class TestRecovery:
     def test_full_disk_does_not_stop_training(
-        self, trained: tuple[Trainer, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+        self, fresh: Trainer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
     ) -> None:
-        trainer, _ = trained
+        trainer = fresh
 
         def full_disk(*args: object, **kwargs: object) -> None:
             raise OSError(28, "No space left on device")
@@ -164,11 +168,11 @@ class TestRecovery:
         assert trainer.lost_checkpoints == lost + 1
         assert "No space left" in capsys.readouterr().err
 
-    def test_bad_minibatch_is_skipped_and_many_stop(self, trained: tuple[Trainer, Path]) -> None:
-        trainer, _ = trained
+    def test_bad_minibatch_is_skipped_and_many_stop(self, fresh: Trainer) -> None:
+        trainer = fresh
         torch.manual_seed(0)
-        batch = trainer.env.rollout(4, trainer.actor, break_when_any_done=False)
         with torch.no_grad():
+            batch = trainer.env.rollout(4, trainer.actor, break_when_any_done=False)
             trainer.gae(batch)
         data = batch.reshape(-1).select(
             "policy", "critic", "action", "action_log_prob", "advantage", "value_target", "state_value"

@@ -96,11 +96,11 @@ class BatchBackend:
         if controls.shape[1] > 1:
             self._batch.rollout(
                 controls.shape[1] - 1,
-                control=controls[:, :-1].double().contiguous().numpy(),
+                control=controls[:, :-1].detach().double().contiguous().numpy(),
                 control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
                 record=(),
             )
-        self.data("ctrl").copy_(controls[:, -1])
+        self.data("ctrl").copy_(controls[:, -1].detach())
         # VEL: positions and velocities of the new state; contact and actuator forces of the last physics step
         self._batch.step(stage=mujoco.mjtStage.mjSTAGE_VEL)
 
