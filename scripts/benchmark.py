@@ -104,7 +104,7 @@ def main(cfg: DictConfig) -> None:
             raw_sps.append(raw.step(_STEPS))
             speed, carry = step_env(env, carry, policy, _STEPS)
             env_sps.append(speed)
-        names = [name for name, _ in make_transforms(cfg, trainer.task)] + ["select outputs"]
+        names = [name for name, _ in make_transforms(cfg, trainer.task)] + ["select outputs", "remove empty specs"]
         costs = transform_times(env, names, carry, policy, _STEPS)
 
         batches = iter(trainer.collector)

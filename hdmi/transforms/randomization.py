@@ -40,6 +40,7 @@ class ModelRandomization(SpecTransform):
         self.per = per
         # of the numbers per world; -1 until the first reset. A buffer, so that a resumed run keeps its worlds.
         self.register_buffer("seed", torch.tensor(-1))
+        self._world_rows: dict[NestedKey, Tensor] = {}  # what the seed gives on top of the nominal model
 
     def draw(self, init: TensorDictBase) -> None:
         """Writes into `init` (batch [N]) what this term randomizes."""
@@ -52,16 +53,26 @@ class ModelRandomization(SpecTransform):
         if init is None:
             init = TensorDict({}, batch_size=tensordict.batch_size, device=tensordict.device)
         if self.per == "world":
-            # the same numbers again: terms per episode build on the rows that this one writes
-            if self.seed < 0:
-                self.seed.copy_(torch.randint(2**31, ()))
-            with torch.random.fork_rng():
-                torch.manual_seed(int(self.seed))
-                self.draw(init)
+            self._draw_again(init)
         else:
             self.draw(init)
         tensordict.set("init", init)
         return tensordict
+
+    def _draw_again(self, init: TensorDictBase) -> None:
+        """The same numbers at every reset: terms per episode build on the rows that this one writes."""
+        before = set(init.keys(True, True))
+        if self._world_rows and not before.intersection(self._world_rows):
+            for key, rows in self._world_rows.items():
+                init.set(key, rows)
+            return
+        if self.seed < 0:
+            self.seed.copy_(torch.randint(2**31, ()))
+        with torch.random.fork_rng():
+            torch.manual_seed(int(self.seed))
+            self.draw(init)
+        written = set(init.keys(True, True)) - before
+        self._world_rows = {key: init.get(key) for key in written}
 
 
 def _rows(init: TensorDictBase, model: mujoco.MjModel, field: str) -> Tensor:

@@ -35,7 +35,7 @@ class TrackedBodies(FunctionTransform):
 
     def function(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         bodies, (root_pos, root_quat) = inputs[:4], inputs[4:]
-        selected = [value[..., self.index, :] for value in bodies]
+        selected = [value.index_select(-2, self.index) for value in bodies]
         return (*selected, *local_pose(selected[0], selected[1], root_pos, root_quat))
 
 
