@@ -37,6 +37,7 @@ LIFT = (1.6, 2.5, 3.5, 4.4)
 BOX_X = 0.32  # of box and stand, ahead of the ankles, m
 LIFT_HEIGHT = 0.15  # m
 CLEARANCE = 0.05  # between palm and box before the palms close in, m
+CARRIED_MASS = 0.5  # kg; the lean backwards allows for a load of this, on the safe side of the box's
 SQUEEZE = 0.045  # how far inside the box's sides the palms are while they hold it, m
 HAND_PITCH = 0.1  # fingers down while at the box, rad
 
@@ -119,7 +120,7 @@ class Solver:
                 self.configuration, tasks, 1.0, "daqp", damping=1e-4, limits=self.limits, constraints=self.feet
             )
             self.configuration.integrate_inplace(velocity, 1.0)
-            if np.abs(velocity).max() < 1e-4:
+            if np.abs(velocity).max() < 2e-5:
                 return self.configuration.q.copy()
         raise RuntimeError(f"inverse kinematics does not settle: last step {np.abs(velocity).max():.1e} rad")
 
@@ -161,10 +162,10 @@ def _posture_task(model: mujoco.MjModel, home: np.ndarray) -> mink.PostureTask:
     return task
 
 
-def com_path(task: Task, time: np.ndarray) -> np.ndarray:
+def com_path(time: np.ndarray) -> np.ndarray:
     """Centre of mass of the robot alone that keeps it, with the box once held, over the same point. [T, 3]"""
     robot_mass = robot_model().body_mass.sum()
-    carried = task.box.mass * there_and_back(time, PRESS)
+    carried = CARRIED_MASS * there_and_back(time, PRESS)
     path = np.zeros((len(time), 3))
     path[:, 0] = COM_X - carried / robot_mass * (BOX_X - COM_X)
     return path
@@ -201,7 +202,7 @@ def body_pose(path: HandPath, frame: int, point: np.ndarray) -> mink.SE3:
 def solve_motion(task: Task, time: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, list[HandPath]]:
     """Positions of the robot model in every frame [T, 36] and the hands' paths that they follow."""
     solver = Solver()
-    com = com_path(task, time)
+    com = com_path(time)
     rest = solver.solve(com[0], {})
     pos, quat = forward_kinematics(rest[None, :3], rest[None, 3:7], rest[None, 7:])
     paths = []
