@@ -36,3 +36,19 @@ def test_lift_box_reference_is_what_its_script_makes(tmp_path: Path) -> None:
     assert made.body_names == shipped.body_names
     np.testing.assert_allclose(made.joint_pos, shipped.joint_pos, atol=1e-3)
     np.testing.assert_array_equal(made.object_contact, shipped.object_contact)
+
+
+def test_adaptive_starts_count_the_terminations_of_the_whole_stack() -> None:
+    from hydra import compose, initialize_config_dir
+
+    from hdmi.build import make_env
+    from hdmi.transforms import AdaptiveStateInitialization
+
+    # every step terminates
+    strict = ["termination.root_pose.thresholds=[-1.0,-1.0]", "termination.root_pose.min_steps=1"]
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        cfg = compose("config", overrides=["reset=adaptive", "num_envs=2", "num_threads=1", *strict])
+    env = make_env(cfg)
+    env.rollout(3, break_when_any_done=False)
+    adaptive = next(t for t in env.transform.transforms if isinstance(t, AdaptiveStateInitialization))
+    assert 5.9 < float(adaptive.failures.sum()) <= 6.0
