@@ -38,7 +38,7 @@ BOX_X = 0.32  # of box and stand, ahead of the ankles, m
 LIFT_HEIGHT = 0.15  # m
 CLEARANCE = 0.05  # between palm and box before the palms close in, m
 CARRIED_MASS = 0.5  # kg; the lean backwards allows for a load of this, on the safe side of the box's
-SQUEEZE = 0.045  # how far inside the box's sides the palms are while they hold it, m
+SQUEEZE = 0.004  # how far inside the box's sides the palms are while they hold it: the depth of a soft contact, m
 HAND_PITCH = 0.1  # fingers down while at the box, rad
 
 FOOT_Y = 0.119  # m

@@ -62,7 +62,7 @@ class RobotConfig:
         effector: `capsule` keeps the hand capsule of the table; `hand` replaces it by a box around the palm,
             `L` adds two thin boxes that hook over an edge.
         self_collisions: let robot geoms collide with each other (parent and child excepted).
-        stiffness: joint name pattern -> N m/rad, instead of the servo table's value (damping keeps its value).
+        stiffness, damping: joint name pattern -> N m/rad and N m s/rad, instead of the servo table's values.
         friction: sliding friction of all robot geoms.
         mesh_dir: folder with Unitree's `<body>.STL` files; used as visuals instead of primitives.
     """
@@ -71,6 +71,7 @@ class RobotConfig:
     effector: Literal["capsule", "hand", "L"] = "capsule"
     self_collisions: bool = False
     stiffness: Mapping[str, float] = field(default_factory=dict)
+    damping: Mapping[str, float] = field(default_factory=dict)
     friction: float = 1.0
     mesh_dir: str | None = None
 
@@ -87,9 +88,11 @@ def match_names(patterns: Sequence[str], names: Sequence[str], where: str = "nam
     return [i for i, name in enumerate(names) if any(re.fullmatch(pattern, name) for pattern in patterns)]
 
 
-def per_joint(values: Mapping[str, float], default: float = 0.0, where: str = "joints") -> np.ndarray:
+def per_joint(
+    values: Mapping[str, float], default: float | np.ndarray = 0.0, where: str = "joints"
+) -> np.ndarray:
     """Expands `{pattern: value}` to the robot's joint order; the last matching pattern wins. [J]"""
-    out = np.full(len(g1.JOINT_NAMES), default)
+    out = np.full(len(g1.JOINT_NAMES), default, dtype=float)
     for pattern, value in values.items():
         out[match_names([pattern], g1.JOINT_NAMES, where)] = value
     return out
@@ -113,8 +116,10 @@ def add_robot(spec: mujoco.MjSpec, config: RobotConfig) -> None:
         raise ValueError(f"robot.effector: expected 'capsule', 'hand' or 'L', got {config.effector!r}")
     bodies: dict[str, mujoco.MjsBody] = {"world": spec.worldbody}
     joints = {joint.body: joint for joint in g1.JOINTS}
-    gains = {joint.name: g1.servo_gains(joint.armature) for joint in g1.JOINTS}
-    stiffness = per_joint(config.stiffness, default=np.nan, where="robot.stiffness")
+    table = np.array([g1.servo_gains(joint.armature) for joint in g1.JOINTS])  # [29, 2]
+    stiffness = per_joint(config.stiffness, default=table[:, 0], where="robot.stiffness")
+    damping = per_joint(config.damping, default=table[:, 1], where="robot.damping")
+    gains = dict(zip(g1.JOINT_NAMES, zip(stiffness, damping, strict=True), strict=True))
 
     for row in g1.BODIES:
         body = bodies[row.parent].add_body(
@@ -133,8 +138,6 @@ def add_robot(spec: mujoco.MjSpec, config: RobotConfig) -> None:
         if row.name in joints:
             joint = joints[row.name]
             kp, kd = gains[joint.name]
-            override = stiffness[g1.JOINT_NAMES.index(joint.name)]
-            kp = kp if np.isnan(override) else float(override)
             # The derivative gain is joint damping: Euler integrates it implicitly, and torque limits then
             # bound the proportional part.
             body.add_joint(
