@@ -14,7 +14,7 @@ from rich.table import Table
 from torchrl.envs import CatTensors, Compose, RemoveEmptySpecs, SelectTransform, Transform, TransformedEnv
 
 from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene
-from hdmi.envs import BatchBackend, HumanoidObjectEnv
+from hdmi.envs import BatchBackend, HumanoidObjectEnv, RowResetEnv
 from hdmi.motion import Reference, find_motion, make_reference
 
 # What leaves the stack besides the state that steps read back.
@@ -141,7 +141,7 @@ def make_env(
         return BatchBackend(model, count, threads)
 
     base = HumanoidObjectEnv(task.scene, num_envs or cfg.num_envs, backend or default_backend, pixels)
-    env = TransformedEnv(base, Compose(*(transform for _, transform in make_transforms(cfg, task))))
+    env = RowResetEnv(base, Compose(*(transform for _, transform in make_transforms(cfg, task))))
     # raw keys are dropped, but for what steps read back and what learners and logs want
     state = set(env.full_state_spec.keys(True, True))
     entries = list(env.full_observation_spec.keys(True, True))

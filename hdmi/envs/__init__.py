@@ -2,5 +2,6 @@
 
 from hdmi.envs.backend import BatchBackend, PhysicsBackend
 from hdmi.envs.humanoid import HumanoidObjectEnv
+from hdmi.envs.rows import RowResetEnv
 
-__all__ = ["BatchBackend", "HumanoidObjectEnv", "PhysicsBackend"]
+__all__ = ["BatchBackend", "HumanoidObjectEnv", "PhysicsBackend", "RowResetEnv"]

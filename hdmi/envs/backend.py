@@ -1,4 +1,4 @@
-"""Physics engines behind one interface: N worlds of one model, live state tensors, masked resets."""
+"""Physics engines behind one interface: N worlds of one model, live state tensors, resets of chosen worlds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import warnings
 from typing import Protocol
 
 import mujoco
-import numpy as np
 import torch
 from mujoco.batch import Batch
 from torch import Tensor
@@ -34,16 +33,16 @@ class PhysicsBackend(Protocol):
         """Advances every world by S physics steps, each under its own controls. [N, S, num_actuators]"""
         ...
 
-    def reset(self, mask: Tensor) -> None:
-        """Puts the masked worlds into the model's default state; follow with `refresh`. mask: bool [N]"""
+    def reset(self, worlds: Tensor) -> None:
+        """Puts worlds into the model's default state; follow with `refresh`. int64 [n]"""
         ...
 
-    def refresh(self, mask: Tensor) -> None:
-        """Recomputes what derives from the state of the masked worlds. mask: bool [N]"""
+    def refresh(self, worlds: Tensor) -> None:
+        """Recomputes what derives from the state of the given worlds. int64 [n]"""
         ...
 
-    def commit_model(self, mask: Tensor) -> None:
-        """Recomputes the constants that derive from model fields of the masked worlds. mask: bool [N]"""
+    def commit_model(self, worlds: Tensor) -> None:
+        """Recomputes the constants that derive from model fields of the given worlds. int64 [n]"""
         ...
 
     def failed(self) -> Tensor:
@@ -92,26 +91,32 @@ class BatchBackend:
         return self._model[field]
 
     def step(self, controls: Tensor) -> None:
-        # One call for all but the last step: every call waits for its slowest world.
-        if controls.shape[1] > 1:
-            self._batch.rollout(
-                controls.shape[1] - 1,
-                control=controls[:, :-1].detach().double().contiguous().numpy(),
-                control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
-                record=(),
-            )
-        self.data("ctrl").copy_(controls[:, -1].detach())
-        # VEL: positions and velocities of the new state; contact and actuator forces of the last physics step
-        self._batch.step(stage=mujoco.mjtStage.mjSTAGE_VEL)
+        controls = controls.detach()
+        num_steps = controls.shape[1]
+        worlds, order = torch.arange(self.num_worlds), torch.arange(num_steps)
+        # Each world goes through its runs of equal controls; worlds whose runs are equally long go together. A step
+        # that stops at VEL has positions and velocities of the new state, forces of the last physics step, and the
+        # next one continues from there: Batch.rollout would compute these stages twice.
+        last_of_run = torch.ones(self.num_worlds, num_steps, dtype=torch.bool)
+        last_of_run[:, :-1] = (controls[:, 1:] != controls[:, :-1]).any(-1)
+        begin = torch.zeros(self.num_worlds, dtype=torch.int64)
+        while (active := begin < num_steps).any():
+            run = last_of_run & (order >= begin.unsqueeze(-1))
+            end = torch.where(active, run.int().argmax(-1) + 1, begin)
+            self.data("ctrl").copy_(controls[worlds, begin.clamp(max=num_steps - 1)])
+            for length in (end - begin)[active].unique().tolist():
+                ids = (end - begin == length).nonzero().squeeze(-1)
+                self._batch.step(ids.numpy(), nstep=length, stage=mujoco.mjtStage.mjSTAGE_VEL)
+            begin = end
 
-    def reset(self, mask: Tensor) -> None:
-        self._batch.reset(_ids(mask), stage=mujoco.mjtStage.mjSTAGE_NONE)
+    def reset(self, worlds: Tensor) -> None:
+        self._batch.reset(worlds.numpy(), stage=mujoco.mjtStage.mjSTAGE_NONE)
 
-    def refresh(self, mask: Tensor) -> None:
-        self._batch.forward(_ids(mask))
+    def refresh(self, worlds: Tensor) -> None:
+        self._batch.forward(worlds.numpy())
 
-    def commit_model(self, mask: Tensor) -> None:
-        self._batch.set_const(_ids(mask))
+    def commit_model(self, worlds: Tensor) -> None:
+        self._batch.set_const(worlds.numpy())
 
     def failed(self) -> Tensor:
         qvel = self.data("qvel")
@@ -123,7 +128,7 @@ class BatchBackend:
         return state | {f"model/{field}": value.clone() for field, value in self._model.items()}
 
     def set_state(self, state: dict[str, Tensor]) -> None:
-        everyone = torch.ones(self.num_worlds, dtype=torch.bool)
+        everyone = torch.arange(self.num_worlds)
         for key, value in state.items():
             kind, field = key.split("/")
             (self.data(field) if kind == "data" else self.model(field)).copy_(value)
@@ -137,6 +142,3 @@ class BatchBackend:
         mujoco.mj_forward(model, data)
         return model, data
 
-
-def _ids(mask: Tensor) -> np.ndarray:
-    return mask.reshape(-1).nonzero().squeeze(-1).numpy()

@@ -136,8 +136,8 @@ class HumanoidObjectEnv(EnvBase):
         failed = self.backend.failed()
         if failed.any():
             self.num_diverged += int(failed.sum())
-            self._reset_worlds(failed, None)
-        out = self._state()
+            self._reset_worlds(failed.nonzero().squeeze(-1), None)
+        out = self._state(slice(None))
         terminated = failed.unsqueeze(-1)
         out.set("diverged", terminated)
         out.set("reward", torch.zeros(self.num_envs, 1, device=self.device))
@@ -148,24 +148,38 @@ class HumanoidObjectEnv(EnvBase):
 
     def _push(self, velocity: Tensor) -> None:
         """Adds linear and angular world velocities to the root. [N, 6]"""
-        mask = (velocity != 0).any(-1)
-        if not mask.any():
+        worlds = (velocity != 0).any(-1).nonzero().squeeze(-1)
+        if not len(worlds):
             return
-        qvel, quat = self.backend.data("qvel"), self._read("qpos")[mask, 3:7]
-        qvel[mask, :3] += velocity[mask, :3].double()
-        qvel[mask, 3:6] += quat_apply_inverse(quat, velocity[mask, 3:]).double()
-        self.backend.refresh(mask)
+        qvel, quat = self.backend.data("qvel"), self.backend.data("qpos")[worlds, 3:7]
+        qvel[worlds, :3] += velocity[worlds, :3].double()
+        qvel[worlds, 3:6] += quat_apply_inverse(quat, velocity[worlds, 3:].double())
+        self.backend.refresh(worlds)
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None:
-            mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        worlds = torch.arange(self.num_envs) if mask is None else mask.reshape(-1).nonzero().squeeze(-1)
         init = None if tensordict is None else tensordict.get("init", None)
-        self._reset_worlds(mask.reshape(-1), init)
-        out = self._state()
-        no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+        self._reset_worlds(worlds, None if init is None else init[worlds])
+        return self._fresh(slice(None), self.batch_size)
+
+    def reset_rows(self, tensordict: TensorDictBase) -> TensorDict:
+        """Resets some worlds and returns only theirs.
+
+        Args:
+            tensordict: batch [n], with the worlds' numbers `worlds` int64 [n]; otherwise as for `reset`.
+
+        Returns:
+            What `reset` writes, batch [n].
+        """
+        worlds = tensordict.get("worlds")
+        self._reset_worlds(worlds, tensordict.get("init", None))
+        return self._fresh(worlds, worlds.shape)
+
+    def _fresh(self, rows: Tensor | slice, batch_size: torch.Size) -> TensorDict:
+        out = self._state(rows)
         for key in ("diverged", "done", "terminated", "truncated"):
-            out.set(key, no.clone())
+            out.set(key, torch.zeros(*batch_size, 1, dtype=torch.bool, device=self.device))
         return out
 
     def _set_seed(self, seed: int | None) -> None:
@@ -184,13 +198,14 @@ class HumanoidObjectEnv(EnvBase):
 
     # -- reset ------------------------------------------------------------------------------------------------
 
-    def _reset_worlds(self, mask: Tensor, init: TensorDictBase | None) -> None:
-        """Puts masked worlds into the model's default state, overwritten by what `init` gives."""
+    def _reset_worlds(self, worlds: Tensor, init: TensorDictBase | None) -> None:
+        """Puts worlds into the model's default state, overwritten by what `init` gives. int64 [n], batch [n]"""
         backend, scene = self.backend, self.scene
-        init = TensorDict({}, batch_size=self.batch_size) if init is None else init
-        self._write_model(mask, init)
-        backend.reset(mask)
-        qpos, qvel = self._default_qpos.expand(self.num_envs, -1).clone(), torch.zeros_like(backend.data("qvel"))
+        init = TensorDict({}, batch_size=worlds.shape) if init is None else init
+        self._write_model(worlds, init)
+        backend.reset(worlds)
+        qpos = self._default_qpos.expand(len(worlds), -1).clone()
+        qvel = torch.zeros(len(worlds), scene.model.nv, dtype=qpos.dtype)
 
         def write(target: Tensor, where: slice | int | None, key: str) -> None:
             value = init.get(key, None)
@@ -215,33 +230,37 @@ class HumanoidObjectEnv(EnvBase):
             write(qpos, slice(q, q + 1), "object_joint_pos")
             write(qvel, slice(v, v + 1), "object_joint_vel")
 
-        backend.data("qpos")[mask] = qpos[mask]
-        backend.data("qvel")[mask] = qvel[mask]
-        backend.data("ctrl")[mask] = qpos[mask][:, self._joint_qpos]
-        backend.refresh(mask)
+        backend.data("qpos")[worlds] = qpos
+        backend.data("qvel")[worlds] = qvel
+        backend.data("ctrl")[worlds] = qpos[:, self._joint_qpos]
+        backend.refresh(worlds)
 
-    def _write_model(self, mask: Tensor, init: TensorDictBase) -> None:
+    def _write_model(self, worlds: Tensor, init: TensorDictBase) -> None:
         commit = False
         fields = init.get("model", None)
         for field, value in () if fields is None else fields.items():
-            self.backend.model(field)[mask] = value[mask].double()
+            self.backend.model(field)[worlds] = value.double()
             commit |= field in _SET_CONST_FIELDS
         scale = init.get("object_scale", None)
         if scale is not None:
-            self._object_scale[mask] = scale[mask]
+            self._object_scale[worlds] = scale
             geoms = torch.from_numpy(self.scene.object_geoms)
             for field, base in self._geom_base.items():
                 rows = self.backend.model(field)
-                rows[mask.nonzero(), geoms] = base[geoms] * scale[mask].double().unsqueeze(-1)
+                rows[worlds.unsqueeze(-1), geoms] = base[geoms] * scale.double().unsqueeze(-1)
             commit = True
         if commit:
-            self.backend.commit_model(mask)
+            self.backend.commit_model(worlds)
 
     # -- reading ----------------------------------------------------------------------------------------------
 
-    def _state(self) -> TensorDict:
+    def _state(self, rows: Tensor | slice) -> TensorDict:
         """Copies the live arrays into fresh float32 tensors: collectors keep references to what they are given."""
-        read, scene = self._read, self.scene
+        scene = self.scene
+
+        def read(field: str) -> Tensor:
+            return self.backend.data(field)[rows].to(torch.float32)
+
         xpos, xquat = read("xpos"), read("xquat")  # [N, nbody, *]
         lin_vel, ang_vel = body_velocity(
             read("cvel"), xpos, read("subtree_com")[:, torch.from_numpy(scene.model.body_rootid)]
@@ -263,7 +282,8 @@ class HumanoidObjectEnv(EnvBase):
             "foot_force": -sensors[:, torch.from_numpy(scene.foot_sensors)],
         }
         robot |= {f"root_{key}": robot[f"body_{key}"][:, 0] for key in ("pos", "quat", "lin_vel", "ang_vel")}
-        n, bs = self.num_envs, self.batch_size
+        n = len(qpos)
+        bs = torch.Size([n])
         state = {"robot": TensorDict(robot, batch_size=bs, device=self.device)}
         if scene.object_body is not None:
             body, link = scene.object_body, scene.object_link
@@ -277,21 +297,19 @@ class HumanoidObjectEnv(EnvBase):
                 "link_quat": xquat[:, link],
                 "joint_pos": torch.zeros(n, 0) if hinge_q is None else qpos[:, hinge_q : hinge_q + 1],
                 "joint_vel": torch.zeros(n, 0) if hinge_v is None else qvel[:, hinge_v : hinge_v + 1],
-                "scale": self._object_scale.clone(),
-                "mass": self._object_model("body_mass", [body, link]),
-                "friction": self._object_model("geom_friction", [int(scene.object_geoms[-1])]),
+                "scale": self._object_scale[rows].clone(),
+                "mass": self._object_model("body_mass", [body, link])[rows],
+                "friction": self._object_model("geom_friction", [int(scene.object_geoms[-1])])[rows],
             }
             force = -sensors[:, torch.from_numpy(scene.effector_sensors)]
             state["object"] = TensorDict(object_, batch_size=bs, device=self.device)
             state["contact"] = TensorDict({"force": force}, batch_size=bs, device=self.device)
         out = TensorDict(state, batch_size=bs, device=self.device)
         if self._pixels is not None:
-            frames = np.stack([self.render(i, *self._pixels) for i in range(n)])
+            worlds = torch.arange(self.num_envs)[rows].tolist()
+            frames = np.stack([self.render(i, *self._pixels) for i in worlds])
             out.set("pixels", torch.from_numpy(frames))
         return out
-
-    def _read(self, field: str) -> Tensor:
-        return self.backend.data(field).to(torch.float32)
 
     def _object_model(self, field: str, ids: list[int | None]) -> Tensor:
         rows = self.backend.model(field)[:, sorted({i for i in ids if i is not None})].to(torch.float32)  # [N, i, ...]

@@ -13,38 +13,24 @@ def quat_conjugate(q: Tensor) -> Tensor:
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product: the rotation b followed by a. [..., 4], [..., 4] -> [..., 4]"""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        dim=-1,
-    )
+    a, b = torch.broadcast_tensors(a, b)  # which torch.linalg.cross does not do by itself
+    aw, axyz, bw, bxyz = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    w = aw * bw - (axyz * bxyz).sum(-1, keepdim=True)
+    return torch.cat([w, aw * bxyz + bw * axyz + torch.linalg.cross(axyz, bxyz)], dim=-1)
 
 
 def quat_apply(q: Tensor, v: Tensor) -> Tensor:
     """Rotates vectors. [..., 4], [..., 3] -> [..., 3]"""
-    w, x, y, z = q.unbind(-1)
-    vx, vy, vz = v.unbind(-1)
-    # v + 2 w (q x v) + 2 q x (q x v), by components: faster than torch.linalg.cross on small tensors
-    tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
-    return torch.stack(
-        [
-            vx + w * tx + y * tz - z * ty,
-            vy + w * ty + z * tx - x * tz,
-            vz + w * tz + x * ty - y * tx,
-        ],
-        dim=-1,
-    )
+    xyz, v = torch.broadcast_tensors(q[..., 1:], v)
+    t = 2 * torch.linalg.cross(xyz, v)
+    return v + q[..., :1] * t + torch.linalg.cross(xyz, t)
 
 
 def quat_apply_inverse(q: Tensor, v: Tensor) -> Tensor:
     """Rotates vectors by the inverse: world to body frame. [..., 4], [..., 3] -> [..., 3]"""
-    return quat_apply(quat_conjugate(q), v)
+    xyz, v = torch.broadcast_tensors(q[..., 1:], v)
+    t = 2 * torch.linalg.cross(v, xyz)
+    return v + q[..., :1] * t + torch.linalg.cross(t, xyz)
 
 
 def quat_angle(a: Tensor, b: Tensor) -> Tensor:

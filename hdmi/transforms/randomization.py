@@ -53,27 +53,36 @@ class ModelRandomization(SpecTransform):
         if init is None:
             init = TensorDict({}, batch_size=tensordict.batch_size, device=tensordict.device)
         if self.per == "world":
-            self._draw_again(init)
+            self._draw_again(init, tensordict.get("worlds", None))
         else:
             self.draw(init)
         tensordict.set("init", init)
         return tensordict
 
-    def _draw_again(self, init: TensorDictBase) -> None:
-        """The same numbers at every reset: terms per episode build on the rows that this one writes."""
-        before = set(init.keys(True, True))
-        if self._world_rows and not before.intersection(self._world_rows):
-            for key, rows in self._world_rows.items():
-                init.set(key, rows)
-            return
+    def _draw_again(self, init: TensorDictBase, worlds: Tensor | None) -> None:
+        """The same numbers at every reset; terms per episode build on the rows that this one writes."""
+        rows = self._world_rows
+        if not rows or set(rows).intersection(init.keys(True, True)):
+            rows = self._draw_everyone(init, worlds)
+        for key, value in rows.items():
+            init.set(key, value if worlds is None else value[worlds])
+
+    def _draw_everyone(self, init: TensorDictBase, worlds: Tensor | None) -> dict[NestedKey, Tensor]:
+        """What the seed gives for all worlds, on top of what terms before wrote for those that reset."""
+        everyone = init.copy()
+        if worlds is not None:
+            everyone = init.new_zeros(self.parent.batch_size)
+            everyone[worlds] = init
+        before = everyone.copy()
         if self.seed < 0:
             self.seed.copy_(torch.randint(2**31, ()))
         with torch.random.fork_rng():
             torch.manual_seed(int(self.seed))
-            self.draw(init)
-        written = set(init.keys(True, True)) - before
-        self._world_rows = {key: init.get(key) for key in written}
-
+            self.draw(everyone)
+        rows = {key: value for key, value in everyone.items(True, True) if value is not before.get(key, None)}
+        if not any(key in before.keys(True, True) for key in rows):
+            self._world_rows = rows
+        return rows
 
 def _rows(init: TensorDictBase, model: mujoco.MjModel, field: str) -> Tensor:
     """A copy of the per-world rows that terms before wrote, or of the model's. [N, ...]"""

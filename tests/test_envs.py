@@ -1,0 +1,108 @@
+"""The physics backend against MuJoCo itself, and resets of rows against resets of everything."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from mocks import lift_box, load_config
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+from hdmi.build import make_env
+from hdmi.envs import BatchBackend
+
+DETERMINISTIC = ("+ablation=no_randomization", "reset.state.start=first", "~reset.state.noise")
+
+
+def env_of(num_envs: int, *overrides: str) -> TransformedEnv:
+    return make_env(load_config(*overrides), num_envs, lift_box())
+
+
+def step_alone(scene, controls: Tensor) -> mujoco.MjData:
+    """One world on plain MuJoCo, one control after another. [S, nu]"""
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = scene.default_qpos
+    mujoco.mj_forward(scene.model, data)
+    for control in controls:
+        data.ctrl[:] = control.numpy()
+        mujoco.mj_step(scene.model, data)
+    mujoco.mj_step1(scene.model, data)
+    return data
+
+
+class TestBackend:
+    @pytest.mark.parametrize(
+        "runs",
+        [
+            [[0, 0, 0, 0]] * 3,  # one control for everyone
+            [[0, 1, 1, 1], [0, 0, 1, 1], [0, 0, 0, 1]],  # delays: each world changes once
+            [[0, 1, 2, 3], [0, 0, 1, 0], [0, 0, 0, 0]],  # anything
+            [[0], [1], [2]],
+        ],
+    )
+    def test_steps_as_mujoco_does(self, robot_scene, runs):
+        torch.manual_seed(0)
+        choices = torch.from_numpy(robot_scene.default_qpos[robot_scene.joint_qpos]) + 0.3 * torch.randn(4, 29)
+        controls = choices[torch.tensor(runs)]  # [N, S, nu]
+        backend = BatchBackend(robot_scene.model, len(runs), num_threads=1)
+        backend.data("qpos")[:] = torch.from_numpy(robot_scene.default_qpos)
+        backend.refresh(torch.arange(len(runs)))
+        backend.step(controls)
+        for world, sequence in enumerate(controls):
+            alone = step_alone(robot_scene, sequence)
+            for field in ("time", "qpos", "qvel", "xpos", "cvel", "actuator_force"):
+                got = backend.data(field)[world].numpy()
+                np.testing.assert_array_equal(got, np.asarray(getattr(alone, field)).reshape(got.shape), field)
+
+
+def advance(env: TransformedEnv, tensordict: TensorDictBase, steps: int) -> TensorDictBase:
+    torch.manual_seed(0)
+    for _ in range(steps):
+        action = 0.3 * torch.randn(env.action_spec.shape)
+        tensordict = env.step_mdp(env.step(tensordict.set("action", action)))
+    return tensordict.exclude("action")
+
+
+class TestRowReset:
+    def test_equals_a_reset_of_everything(self):
+        env = env_of(4, *DETERMINISTIC)
+        before = advance(env, env.reset(), 3)
+        before["done"][[1, 3]] = True
+        state, kept = env.base_env.get_state(), before.clone()
+        rows = env.maybe_reset(before.copy())
+        after_rows = env.base_env.get_state()
+        env.base_env.set_state(state)
+        everything = TransformedEnv.maybe_reset(env, kept.clone())
+        assert set(rows.keys(True, True)) == set(everything.keys(True, True))
+        for key in rows.keys(True, True):
+            assert torch.equal(rows[key], everything[key]), key
+        for field in ("qpos", "qvel", "ctrl"):
+            assert torch.equal(after_rows["backend", f"data/{field}"], env.base_env.backend.data(field)), field
+        assert rows["step_count"].flatten().tolist() == [3, 0, 3, 0]
+        assert (rows["episode_reward"].flatten() == 0).tolist() == [False, True, False, True]
+
+    def test_leaves_the_last_step_as_it_was(self):
+        env = env_of(3, *DETERMINISTIC)
+        before = advance(env, env.reset(), 2)
+        before["done"][0] = True
+        kept, given = before.clone(), before.copy()
+        env.maybe_reset(before)
+        for key in kept.keys(True, True):
+            assert torch.equal(given[key], kept[key]), key
+
+    def test_worlds_stay_themselves(self):
+        """What is drawn per world comes back for the world that resets, at its own row."""
+        env = env_of(5)
+        start = env.reset()
+        model = env.base_env.scene.model
+        links = [i for i in range(model.nbody) if model.body(i).name.endswith("_link")]
+        box = model.body("box").id
+        mass = env.base_env.backend.model("body_mass")
+        before = mass.clone()
+        start["done"][2] = True
+        env.maybe_reset(start)
+        assert torch.equal(mass[:, links], before[:, links])
+        assert (mass[:, box] != before[:, box]).tolist() == [False, False, True, False, False]
