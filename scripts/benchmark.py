@@ -18,6 +18,7 @@ from typing import Any
 
 import hydra
 import mujoco
+import numpy as np
 import torch
 from mujoco.batch import Batch
 from omegaconf import DictConfig
@@ -33,32 +34,56 @@ _BLOCKS, _STEPS, _ITERATIONS = 7, 20, 4
 
 
 class RawPhysics:
-    """MuJoCo's Batch alone on the model of an environment, from the environment's present states and targets."""
+    """MuJoCo's Batch alone on the model of an environment, through what that environment has just gone through.
+
+    It starts from the same states and is given the same joint targets, once per control step; nothing is reset, read
+    or delayed. With targets that do not change, robots come to rest and physics gets cheaper than in training.
+    """
 
     def __init__(self, env: TransformedEnv, num_threads: int):
         self.base = env.base_env
         self.batch = Batch(self.base.scene.model, self.base.num_envs, num_threads, persistent=True)
+        self.start: dict[str, np.ndarray] = {}
+        self.targets: list[np.ndarray] = []
 
-    def step(self, count: int) -> float:
+    def begin(self) -> None:
+        """Remembers the states from which to start."""
+        fields = ("qpos", "qvel", "ctrl", "qacc_warmstart")
+        self.start = {field: self.base.backend.data(field).numpy().copy() for field in fields}
+        self.targets = []
+
+    def record(self) -> None:
+        """Remembers the targets of the environment's last step."""
+        self.targets.append(self.base.backend.data("ctrl").numpy().copy())
+
+    def replay(self) -> float:
         """Control steps of all worlds per second."""
-        for field in ("qpos", "qvel", "ctrl"):
-            self.batch.bind(field)[:] = self.base.backend.data(field).numpy()
+        for field, values in self.start.items():
+            self.batch.bind(field)[:] = values
         self.batch.forward()
+        ctrl = self.batch.bind("ctrl")
         start = time.perf_counter()
-        for _ in range(count):
+        for targets in self.targets:
+            ctrl[:] = targets
             self.batch.step(nstep=self.base.scene.sim.decimation, stage=mujoco.mjtStage.mjSTAGE_VEL)
-        return self.base.num_envs * count / (time.perf_counter() - start)
+        return self.base.num_envs * len(self.targets) / (time.perf_counter() - start)
 
 
-def step_env(env: TransformedEnv, carry: TensorDictBase, policy: Any, count: int) -> tuple[float, TensorDictBase]:
-    """Steps with resets under the policy's actions; policy time is not counted."""
+def step_env(
+    env: TransformedEnv, carry: TensorDictBase, policy: Any, count: int, raw: RawPhysics | None = None
+) -> tuple[float, TensorDictBase]:
+    """Steps with resets under the policy's actions, recorded for `raw`; policy time is not counted."""
     spent = 0.0
+    if raw is not None:
+        raw.begin()
     for _ in range(count):
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             carry = policy(carry)
         start = time.perf_counter()
         _, carry = env.step_and_maybe_reset(carry)
         spent += time.perf_counter() - start
+        if raw is not None:
+            raw.record()
     return env.base_env.num_envs * count / spent, carry
 
 
@@ -97,13 +122,13 @@ def main(cfg: DictConfig) -> None:
         raw = RawPhysics(env, cfg.num_threads)
         with torch.no_grad():
             carry = env.reset()
-        _, carry = step_env(env, carry, policy, _STEPS)
-        raw.step(_STEPS)
+        _, carry = step_env(env, carry, policy, _STEPS, raw)
+        raw.replay()
         raw_sps, env_sps = [], []
         for _ in range(_BLOCKS):
-            raw_sps.append(raw.step(_STEPS))
-            speed, carry = step_env(env, carry, policy, _STEPS)
+            speed, carry = step_env(env, carry, policy, _STEPS, raw)
             env_sps.append(speed)
+            raw_sps.append(raw.replay())
         names = [name for name, _ in make_transforms(cfg, trainer.task)] + ["select outputs", "remove empty specs"]
         costs = transform_times(env, names, carry, policy, _STEPS)
 
@@ -121,7 +146,7 @@ def main(cfg: DictConfig) -> None:
                 collect.append(frames / (middle - start))
                 learn.append(frames / (end - middle))
                 train.append(frames / (end - start))
-                raw_beside.append(raw.step(_STEPS))
+                raw_beside.append(raw.replay())
         trainer.collector.shutdown()
 
     median = statistics.median
