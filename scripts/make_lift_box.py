@@ -1,7 +1,7 @@
 """Makes the reference motion `lift_box`: the robot stands before a stand, lifts a box off it and puts it back.
 
-The palms and the box follow minimum-jerk paths; inverse kinematics finds the joints, with the feet planted and the
-centre of mass of robot and carried box held over them. While the box is held the palms are asked to be a little
+The fingertips and the box follow minimum-jerk paths; inverse kinematics finds the joints, with the feet planted and the
+centre of mass of robot and carried box held over them. While the box is held the fingertips are asked to be a little
 inside its sides, so that servos that follow the reference squeeze it. Sizes, mass and contact points are the task's.
 
     python scripts/make_lift_box.py --out hdmi/motion/references/lift_box
@@ -32,12 +32,12 @@ DURATION = 6.0  # s
 # begin and end of the way out, begin and end of the way back, s
 REACH = (0.2, 1.1, 4.8, 5.7)
 PRESS = (1.1, 1.45, 4.5, 4.8)
-LIFT = (1.6, 2.5, 3.5, 4.4)
+LIFT = (1.6, 2.6, 3.4, 4.4)
 
-BOX_X = 0.32  # of box and stand, ahead of the ankles, m
+BOX_X = 0.35  # of box and stand, ahead of the ankles, m
 LIFT_HEIGHT = 0.15  # m
 CLEARANCE = 0.05  # between palm and box before the palms close in, m
-CARRIED_MASS = 0.5  # kg; the lean backwards allows for a load of this, on the safe side of the box's
+CARRIED_MASS = 0.5  # kg; the lean backwards allows for a load of this
 SQUEEZE = 0.004  # how far inside the box's sides the palms are while they hold it: the depth of a soft contact, m
 HAND_PITCH = 0.1  # fingers down while at the box, rad
 
@@ -115,12 +115,12 @@ class Solver:
         for name, pose in hands.items():
             self.hands[name].set_target(pose)
             tasks.append(self.hands[name])
-        for _ in range(100):
+        for _ in range(400):
             velocity = mink.solve_ik(
-                self.configuration, tasks, 1.0, "daqp", damping=1e-4, limits=self.limits, constraints=self.feet
+                self.configuration, tasks, 1.0, "daqp", damping=1e-2, limits=self.limits, constraints=self.feet
             )
             self.configuration.integrate_inplace(velocity, 1.0)
-            if np.abs(velocity).max() < 2e-5:
+            if np.abs(velocity).max() < 1e-4:
                 return self.configuration.q.copy()
         raise RuntimeError(f"inverse kinematics does not settle: last step {np.abs(velocity).max():.1e} rad")
 
