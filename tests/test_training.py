@@ -98,9 +98,17 @@ class TestResume:
             time.sleep(0.1)
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
-        state = load_checkpoint(tmp_path / "run")
-        resumed = Trainer(config(f"resume={tmp_path / 'run'}"), tmp_path / "run")
-        assert resumed.iteration == state["iteration"] >= 2
+        reached = load_checkpoint(tmp_path / "run")["iteration"]
+        assert reached >= 2
+        budget = f"total_frames={32 * (reached + 1)}"
+        resumed = Trainer(config(budget, f"resume={tmp_path / 'run'}"), tmp_path / "run")
+        assert resumed.iteration == reached
+        resumed.run()
+        straight = Trainer(config(budget), tmp_path / "straight")
+        straight.run()
+        assert resumed.iteration == straight.iteration == reached + 1
+        for a, b in zip(straight.actor.parameters(), resumed.actor.parameters(), strict=True):
+            torch.testing.assert_close(a, b, rtol=0, atol=0)
 
     def test_refuses_another_task(self, trained: tuple[Trainer, Path], tmp_path: Path) -> None:
         _, folder = trained

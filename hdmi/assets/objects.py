@@ -76,6 +76,8 @@ class ObjectConfig:
         geoms: in the frame of that body (`GeomConfig` or the same as a mapping).
         mass: kg, spread over the geoms (of the link, if articulated and fixed) by volume.
         friction: sliding friction.
+        torsional_friction: m, about the radius of the patch in which hands touch it: contacts then resist turning about
+            their normal, too (condim 4); 0: they do not.
         hinge: the link of an articulated object.
         fixed_base: static in the world at the reference's first pose.
         rgba: colour.
@@ -85,6 +87,7 @@ class ObjectConfig:
     geoms: Sequence[Any] = ()
     mass: float = 1.0
     friction: float = 0.6
+    torsional_friction: float = 0.0
     hinge: Any = None
     fixed_base: bool = False
     rgba: Sequence[float] = (0.80, 0.56, 0.30, 1.0)
@@ -115,7 +118,7 @@ class SceneryConfig:
     rgba: Sequence[float] = (0.55, 0.58, 0.62, 1.0)
 
 
-_WORLD_KWARGS = {"contype": WORLD_BIT, "conaffinity": ROBOT_BIT | WORLD_BIT, "condim": 3}
+_WORLD_KWARGS = {"contype": WORLD_BIT, "conaffinity": ROBOT_BIT | WORLD_BIT}
 _SHAPES = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -164,6 +167,7 @@ def add_geoms(
     mass: float | None,
     friction: float,
     rgba: Sequence[float],
+    torsional_friction: float = 0.0,
 ) -> None:
     """Adds collision geoms that are also the visuals to `body`; `mass` is spread over them by volume.
 
@@ -182,7 +186,8 @@ def add_geoms(
             "name": f"{body.name}_geom{i}",
             "pos": _rotate(config.body_quat, config.pos),
             "quat": _multiply(config.body_quat, config.quat),
-            "friction": [friction, 0.005, 0.0001],
+            "friction": [friction, torsional_friction or 0.005, 0.0001],
+            "condim": 4 if torsional_friction else 3,
             "rgba": config.rgba or rgba,
         }
         if config.mesh is not None:
@@ -224,7 +229,8 @@ def add_object(spec: mujoco.MjSpec, config: ObjectConfig, pos: Sequence[float], 
         body.add_freejoint(name="object_root")
     hinge = config.hinge
     base_mass = None if config.fixed_base else config.mass * (1.0 if hinge is None else 0.5)
-    add_geoms(spec, body, config.geoms, mass=base_mass, friction=config.friction, rgba=config.rgba)
+    surface = {"friction": config.friction, "torsional_friction": config.torsional_friction, "rgba": config.rgba}
+    add_geoms(spec, body, config.geoms, mass=base_mass, **surface)
     if hinge is None:
         return
     link = body.add_body(name=hinge.body, pos=hinge.pos, quat=hinge.quat)
@@ -238,7 +244,7 @@ def add_object(spec: mujoco.MjSpec, config: ObjectConfig, pos: Sequence[float], 
         damping=[hinge.damping, 0, 0],
     )
     link_mass = config.mass if config.fixed_base else config.mass * 0.5
-    add_geoms(spec, link, hinge.geoms, mass=link_mass, friction=config.friction, rgba=config.rgba)
+    add_geoms(spec, link, hinge.geoms, mass=link_mass, **surface)
     spec.add_exclude(bodyname1=config.name, bodyname2=hinge.body)
 
 
