@@ -1,8 +1,8 @@
 """Makes the reference motion `lift_box`: the robot stands before a stand, lifts a box off it and puts it back.
 
 The fingertips and the box follow minimum-jerk paths; inverse kinematics finds the joints, with the feet planted and the
-centre of mass of robot and carried box held over them. While the box is held the fingertips are a little inside its
-sides, as soft contacts are; how hard to squeeze is left to the policy. Sizes, mass and contact points are the task's.
+centre of mass of robot and carried box held over them. While the box is held the fingertips are asked to be a little
+inside its sides, so that servos that follow the reference squeeze it. Sizes, mass and contact points are the task's.
 
     python scripts/make_lift_box.py --out hdmi/motion/references/lift_box
 """
@@ -38,7 +38,7 @@ BOX_X = 0.35  # of box and stand, ahead of the ankles, m
 LIFT_HEIGHT = 0.15  # m
 CLEARANCE = 0.05  # between fingertip and box before the hands close in, m
 CARRIED_MASS = 0.5  # kg; the lean backwards allows for a load of this
-SQUEEZE = 0.004  # how far inside the box's sides the fingertips are while they hold it: the depth of a soft contact, m
+SQUEEZE = 0.02  # how far inside the box's sides the fingertips are asked to be while they hold it, m
 HAND_PITCH = 0.1  # fingers down while at the box, rad
 
 FOOT_Y = 0.119  # m
