@@ -88,9 +88,7 @@ def match_names(patterns: Sequence[str], names: Sequence[str], where: str = "nam
     return [i for i, name in enumerate(names) if any(re.fullmatch(pattern, name) for pattern in patterns)]
 
 
-def per_joint(
-    values: Mapping[str, float], default: float | np.ndarray = 0.0, where: str = "joints"
-) -> np.ndarray:
+def per_joint(values: Mapping[str, float], default: float | np.ndarray = 0.0, where: str = "joints") -> np.ndarray:
     """Expands `{pattern: value}` to the robot's joint order; the last matching pattern wins. [J]"""
     out = np.full(len(g1.JOINT_NAMES), default, dtype=float)
     for pattern, value in values.items():

@@ -25,6 +25,7 @@ class SimConfig:
         timestep: of physics, s.
         decimation: physics steps per control step.
         integrator, cone: MuJoCo's; Euler treats joint damping implicitly.
+        impratio: of frictional to normal contact stiffness, for elliptic cones: above 1, what is held creeps less.
         iterations, ls_iterations: of the constraint solver.
     """
 
@@ -32,6 +33,7 @@ class SimConfig:
     decimation: int = 4
     integrator: Literal["euler", "implicitfast"] = "euler"
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"
+    impratio: float = 1.0
     iterations: int = 10
     ls_iterations: int = 20
 
@@ -163,6 +165,7 @@ def _set_options(spec: mujoco.MjSpec, sim: SimConfig) -> None:
     spec.option.timestep = sim.timestep
     spec.option.integrator = integrators[sim.integrator]
     spec.option.cone = cones[sim.cone]
+    spec.option.impratio = sim.impratio
     spec.option.iterations = sim.iterations
     spec.option.ls_iterations = sim.ls_iterations
     # A diverged world must be seen and reset by the environment, not silently by MuJoCo.

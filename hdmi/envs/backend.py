@@ -141,4 +141,3 @@ class BatchBackend:
         data = self._batch.get_data(index)
         mujoco.mj_forward(model, data)
         return model, data
-

@@ -84,6 +84,7 @@ class ModelRandomization(SpecTransform):
             self._world_rows = rows
         return rows
 
+
 def _rows(init: TensorDictBase, model: mujoco.MjModel, field: str) -> Tensor:
     """A copy of the per-world rows that terms before wrote, or of the model's. [N, ...]"""
     rows = init.get(("model", field), None)
