@@ -88,6 +88,14 @@ class TestRobot:
         others = [i for i in range(29) if "knee" not in model.actuator(i).name]
         np.testing.assert_array_equal(model.actuator_gainprm[others], robot_scene.model.actuator_gainprm[others])
 
+    def test_damping_override(self, robot_scene):
+        model = scene_with(robot=RobotConfig(damping={"waist_.*_joint": 5.0})).model
+        waist = [model.jnt_dofadr[model.joint(f"waist_{axis}_joint").id] for axis in ("yaw", "roll", "pitch")]
+        assert model.dof_damping[waist].tolist() == [5.0, 5.0, 5.0]
+        others = np.setdiff1d(np.arange(model.nv), waist)
+        np.testing.assert_array_equal(model.dof_damping[others], robot_scene.model.dof_damping[others])
+        np.testing.assert_array_equal(model.actuator_gainprm, robot_scene.model.actuator_gainprm)
+
     def test_a_scene_moves_the_robot_as_forward_kinematics_does(self, robot_scene, pose):
         joint_pos = np.random.default_rng(0).uniform(-0.5, 0.5, 29)
         data = pose(robot_scene, joint_pos)
@@ -362,6 +370,20 @@ class TestMeshes:
         with pytest.raises(FileNotFoundError, match=r"no file nowhere\.obj"):
             scene_with(ObjectConfig("crate", [{"mesh": "nowhere.obj"}]))
 
+    @pytest.mark.parametrize(("torsional_friction", "spins"), [(0.0, True), (0.05, False)])
+    def test_torsional_friction_stops_a_spin(self, torsional_friction, spins):
+        """A ball touches the floor in one point: sliding friction does not brake its spin, a contact patch does."""
+        ball = ObjectConfig("ball", [{"sphere": 0.1}], torsional_friction=torsional_friction)
+        scene = scene_with(ball, placements={"ball": ((2.0, 0.0, 0.1), UPRIGHT)})
+        data = mujoco.MjData(scene.model)
+        data.qpos[:] = scene.default_qpos
+        spin = scene.object_free_dof + 5
+        data.qvel[spin] = 10.0
+        for _ in range(200):
+            mujoco.mj_step(scene.model, data)
+        assert (data.qvel[spin] > 9.0) == spins
+        assert spins or abs(data.qvel[spin]) < 1.0
+
     def test_flat_mesh_is_an_error(self, tmp_path):
         square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [1, 3, 2]], process=False)
         square.export(tmp_path / "square.obj")
@@ -372,6 +394,9 @@ class TestMeshes:
 class TestScene:
     def test_control_period(self):
         assert SimConfig(timestep=0.004, decimation=5).control_dt == pytest.approx(0.02)
+
+    def test_friction_stiffness(self):
+        assert build_scene(RobotConfig(), SimConfig(cone="elliptic", impratio=10.0)).model.opt.impratio == 10.0
 
     @pytest.mark.parametrize("field", ["integrator", "cone"])
     def test_unknown_option_is_an_error(self, field):

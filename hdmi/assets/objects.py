@@ -229,7 +229,11 @@ def add_object(spec: mujoco.MjSpec, config: ObjectConfig, pos: Sequence[float], 
         body.add_freejoint(name="object_root")
     hinge = config.hinge
     base_mass = None if config.fixed_base else config.mass * (1.0 if hinge is None else 0.5)
-    surface = {"friction": config.friction, "torsional_friction": config.torsional_friction, "rgba": config.rgba}
+    surface: dict[str, Any] = {
+        "friction": config.friction,
+        "torsional_friction": config.torsional_friction,
+        "rgba": config.rgba,
+    }
     add_geoms(spec, body, config.geoms, mass=base_mass, **surface)
     if hinge is None:
         return
