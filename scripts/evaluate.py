@@ -1,10 +1,12 @@
 """Evaluates a checkpoint by the paper's protocol; prints the figures and writes eval.json.
 
     python scripts/evaluate.py checkpoint=RUN [num_envs=256] [terminations=all] [seed=0] [task=NAME] ...
+    python scripts/evaluate.py agent=zero|random [task=lift_box] ...
 
 `checkpoint` is a run folder (its newest checkpoint counts) or a checkpoint file. `terminations` are those that end
 an episode as a failure: `all` that the policy was trained with, `none`, or a list such as
-[root_pose,object_pose].
+[root_pose,object_pose]. An agent instead of a checkpoint shows what a task is without a policy, in the environment of
+the default config; its figures are written only where `out` says.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ from rich.console import Console
 
 from hdmi.build import ConfigError
 from hdmi.cli import USER_ERRORS
-from hdmi.evaluation import evaluate_checkpoint
+from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy
+from hdmi.evaluation.agents import AGENTS, BlindAgent, task_config
 from hdmi.evaluation.options import parse_options, parse_terminations
 
 
@@ -26,13 +29,27 @@ class Options:
     """See the module."""
 
     checkpoint: str | None = None
+    agent: str | None = None
     num_envs: int = 256
     terminations: Any = "all"
     seed: int = 0
-    task: str | None = None  # that the checkpoint must be of
+    task: str | None = None  # for an agent: lift_box; for a checkpoint: that it must be of
     motion_root: str | None = None  # instead of the training's
     num_threads: int | None = None  # of physics, instead of the training's
     out: str | None = None  # instead of eval.json in the run folder
+
+
+def evaluate_agent(options: Options, terminations: list[str] | None) -> EvalResult:
+    """Evaluates an agent that needs no training."""
+    assert options.agent is not None
+    cfg = task_config(options.task or "lift_box", options.motion_root)
+    if options.num_threads is not None:
+        cfg.num_threads = options.num_threads
+    agent = BlindAgent(options.agent, cfg.action.history.size)
+    result = evaluate_policy(agent, cfg, options.num_envs, terminations=terminations, seed=options.seed)
+    if options.out is not None:
+        result.save(options.out)
+    return result
 
 
 def main(arguments: list[str]) -> int:
@@ -43,25 +60,30 @@ def main(arguments: list[str]) -> int:
     console = Console()
     try:
         options = parse_options(Options, arguments)
-        if options.checkpoint is None:
-            raise ConfigError("give checkpoint=RUN, a run folder or a checkpoint file")
+        if (options.checkpoint is None) == (options.agent is None):
+            raise ConfigError(f"give either checkpoint=RUN or agent=, one of {', '.join(AGENTS)}")
         if options.num_envs < 1:
             raise ConfigError(f"num_envs: expected at least 1, got {options.num_envs}")
-        result = evaluate_checkpoint(
-            options.checkpoint,
-            options.num_envs,
-            parse_terminations(options.terminations),
-            options.seed,
-            options.out,
-            options.task,
-            options.motion_root,
-            options.num_threads,
-        )
+        terminations = parse_terminations(options.terminations)
+        if options.checkpoint is None:
+            result = evaluate_agent(options, terminations)
+        else:
+            result = evaluate_checkpoint(
+                options.checkpoint,
+                options.num_envs,
+                terminations,
+                options.seed,
+                options.out,
+                options.task,
+                options.motion_root,
+                options.num_threads,
+            )
     except (*USER_ERRORS, OSError) as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 2
     console.print(result.table())
-    print(result.path)
+    if result.path is not None:
+        print(result.path)
     return 0
 
 

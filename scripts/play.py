@@ -15,20 +15,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
-from tensordict import TensorDictBase
-
 from hdmi.build import ConfigError, Task, make_task
 from hdmi.cli import USER_ERRORS
 from hdmi.evaluation import RenderingError
+from hdmi.evaluation.agents import AGENTS, BlindAgent, task_config
 from hdmi.evaluation.options import parse_options
 from hdmi.evaluation.protocol import Policy, load_checked_policy, run_folder_of
 from hdmi.evaluation.video import Moment, Overlay, every, play_moments, replay, show, write_video
-
-CONF = Path(__file__).resolve().parents[1] / "conf"
-AGENTS = ("zero", "random", "reference")
 
 
 @dataclass
@@ -48,31 +41,6 @@ class Options:
     height: int = 480
 
 
-def compose_config(task: str, motion_root: str | None = None) -> DictConfig:
-    """The default config with a task.
-
-    Raises:
-        ConfigError: if there is no such task.
-    """
-    tasks = sorted(path.stem for path in (CONF / "task").glob("*.yaml"))
-    if task not in tasks:
-        raise ConfigError(f"task: there is no {task!r}; there is {', '.join(tasks)}")
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("config", overrides=[f"task={task}"])
-    cfg.motion_root = motion_root
-    return cfg
-
-
-def make_agent(agent: str, action_size: int) -> Policy:
-    """An agent that looks at nothing: `zero`, or `random` in [-1, 1]."""
-
-    def act(tensordict: TensorDictBase) -> TensorDictBase:
-        action = torch.zeros(*tensordict.batch_size, action_size)
-        return tensordict.set("action", action if agent == "zero" else action.uniform_(-1, 1))
-
-    return act
-
-
 def prepare(options: Options) -> tuple[Task, Iterator[Moment], Path]:
     """What the options ask to play: its task, its moments, and where the video goes.
 
@@ -80,7 +48,7 @@ def prepare(options: Options) -> tuple[Task, Iterator[Moment], Path]:
         ConfigError, MotionError, CheckpointError: for options that cannot be met.
     """
     if (options.checkpoint is None) == (options.agent is None):
-        raise ConfigError(f"give either checkpoint=RUN or agent=, one of {', '.join(AGENTS)}")
+        raise ConfigError(f"give either checkpoint=RUN or agent=, one of {', '.join((*AGENTS, 'reference'))}")
     for name in ("stride", "width", "height"):
         if getattr(options, name) < 1:
             raise ConfigError(f"{name}: expected at least 1, got {getattr(options, name)}")
@@ -90,12 +58,12 @@ def prepare(options: Options) -> tuple[Task, Iterator[Moment], Path]:
         cfg.motion_root = options.motion_root or cfg.motion_root
         out = run_folder_of(Path(info["file"])) / "play.mp4"
     else:
-        if options.agent not in AGENTS:
-            raise ConfigError(f"agent: there is no {options.agent!r}; there is {', '.join(AGENTS)}")
-        cfg = compose_config(options.task or "lift_box", options.motion_root)
+        if options.agent not in (agents := (*AGENTS, "reference")):
+            raise ConfigError(f"agent: there is no {options.agent!r}; there is {', '.join(agents)}")
+        cfg = task_config(options.task or "lift_box", options.motion_root)
         out = Path(f"play_{cfg.task.name}_{options.agent}.mp4")
         if options.agent != "reference":
-            policy = make_agent(options.agent, cfg.action.history.size)
+            policy = BlindAgent(options.agent, cfg.action.history.size)
     task = make_task(cfg)
     last = task.reference.num_frames - 1
     if not 0 <= options.start < last:

@@ -263,6 +263,16 @@ def short(moments: Iterator[video.Moment], count: int = 4) -> Iterator[video.Mom
 
 
 @pytest.mark.usefixtures("gl")
+def test_an_agent_is_evaluated_without_a_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "zero.json"
+    assert script("evaluate").main(["agent=zero", "num_envs=4", "num_threads=1", f"out={out}"]) == 0
+    figures = json.loads(out.read_text())
+    assert figures["task"] == "lift_box"
+    assert 0 <= figures["success_rate"]["mean"] <= 1
+    # it stands and moves as the reference asks its servos to
+    assert figures["body_error"]["mean"] < 0.1
+
+
 @pytest.mark.parametrize("agent", ["zero", "random", "reference"])
 def test_agents_play_into_a_video(
     agent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -347,7 +357,8 @@ def test_termination_choices():
 @pytest.mark.parametrize(
     ("name", "arguments", "message"),
     [
-        ("evaluate", [], "give checkpoint=RUN"),
+        ("evaluate", [], "give either checkpoint=RUN or agent=, one of zero, random"),
+        ("evaluate", ["agent=best"], "there is no 'best'; there is zero, random"),
         ("evaluate", ["checkpoint=nowhere"], "nowhere"),
         ("evaluate", ["run=nowhere"], "unknown option 'run'"),
         ("play", [], "give either checkpoint=RUN or agent="),
