@@ -37,7 +37,6 @@ LIFT = (1.6, 2.6, 3.4, 4.4)
 BOX_X = 0.35  # of box and stand, ahead of the ankles, m
 LIFT_HEIGHT = 0.15  # m
 CLEARANCE = 0.05  # between fingertip and box before the hands close in, m
-CARRIED_MASS = 0.5  # kg; the lean backwards allows for a load of this
 SQUEEZE = 0.02  # how far inside the box's sides the fingertips are asked to be while they hold it, m
 HAND_PITCH = 0.1  # fingers down while at the box, rad
 
@@ -65,7 +64,7 @@ class Task:
 
 @dataclass(frozen=True)
 class HandPath:
-    """Where a hand's contact point and its hand's orientation should be."""
+    """Where a hand's contact point and its orientation should be."""
 
     point: np.ndarray  # [T, 3]
     quat: np.ndarray  # [T, 4]
@@ -162,10 +161,10 @@ def _posture_task(model: mujoco.MjModel, home: np.ndarray) -> mink.PostureTask:
     return task
 
 
-def com_path(time: np.ndarray) -> np.ndarray:
+def com_path(task: Task, time: np.ndarray) -> np.ndarray:
     """Centre of mass of the robot alone that keeps it, with the box once held, over the same point. [T, 3]"""
     robot_mass = robot_model().body_mass.sum()
-    carried = CARRIED_MASS * there_and_back(time, PRESS)
+    carried = task.box.mass * there_and_back(time, PRESS)
     path = np.zeros((len(time), 3))
     path[:, 0] = COM_X - carried / robot_mass * (BOX_X - COM_X)
     return path
@@ -202,7 +201,7 @@ def body_pose(path: HandPath, frame: int, point: np.ndarray) -> mink.SE3:
 def solve_motion(task: Task, time: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, list[HandPath]]:
     """Positions of the robot model in every frame [T, 36] and the hands' paths that they follow."""
     solver = Solver()
-    com = com_path(time)
+    com = com_path(task, time)
     rest = solver.solve(com[0], {})
     pos, quat = forward_kinematics(rest[None, :3], rest[None, 3:7], rest[None, 7:])
     paths = []

@@ -249,6 +249,18 @@ class TestRepeatability:
         assert_same(state, before)
 
 
+def test_a_box_left_on_its_stand_fails_lift_box():
+    """The task's limit on the object's position is passed for longer than it forgives by a box that never moves."""
+    limit = load_config().termination.object_pose
+    height = lift_box().reference.object_pos[:, 2]
+    above = (height - height[0]) > limit.thresholds[0]
+    longest = count = 0
+    for frame in above.tolist():
+        count = count + 1 if frame else 0
+        longest = max(longest, count)
+    assert longest > limit.min_steps
+
+
 class TestDivergence:
     def test_a_diverged_world_is_ended_counted_and_reset(self):
         env = env_of("+ablation=no_randomization")

@@ -9,8 +9,8 @@ from torchrl.envs import TransformedEnv
 class RowResetEnv(TransformedEnv):
     """A `TransformedEnv` that resets only rows: the stack sees a batch of the n environments that are done.
 
-    TorchRL computes a reset for all N environments and keeps n of them; with few episodes ending at a step, that is
-    most of what a deep stack costs. Here base environment and transforms are given the n rows, with their numbers
+    TorchRL computes a reset for all N environments and keeps n of them; where few episodes end at a step, a deep stack
+    then costs twice. Here base environment and transforms are given the n rows, with their numbers
     under `worlds` int64 [n], and results are written into copies of the others' tensors. `reset` itself is unchanged.
 
     The base environment must have `reset_rows` (see `HumanoidObjectEnv`), and transforms must take the batch size
