@@ -111,6 +111,8 @@ def build_scene(
     _set_options(spec, sim)
     _add_floor(spec)
     add_robot(spec, robot)
+    for actuator in spec.actuators:
+        actuator.nsample = sim.decimation  # room for a control per physics step; no delay
     if object is not None:
         add_object(spec, object, *placements.get(object.name, ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))))
     for item in scenery:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from typing import Protocol
 
@@ -65,11 +66,24 @@ class PhysicsBackend(Protocol):
 class BatchBackend:
     """MuJoCo's `Batch`: worlds stepped by a pool of C threads on the CPU.
 
+    Controls that change within a control step cost nothing: they are laid out in MuJoCo's history of each actuator,
+    which then acts one control step late on the schedule instead of on `ctrl`.
+
     Args:
         num_threads: 0 for all processors.
     """
 
     def __init__(self, model: mujoco.MjModel, num_worlds: int, num_threads: int = 0):
+        slots = set(model.actuator_history[:, 0].tolist())
+        if len(slots) != 1 or 0 in slots:
+            raise ValueError(
+                "model: the controls of one control step are scheduled in its actuators' history; "
+                f"all need nsample = decimation, they have {sorted(slots)}"
+            )
+        self._slots = slots.pop()
+        self._timestep = model.opt.timestep
+        model = copy.copy(model)
+        model.actuator_delay[:] = self._slots * self._timestep
         # persistent: otherwise a masked forward gives reset worlds another world's contact forces
         self._batch = Batch(model, num_worlds, num_threads, persistent=True)
         self.num_worlds = num_worlds
@@ -91,28 +105,31 @@ class BatchBackend:
         return self._model[field]
 
     def step(self, controls: Tensor) -> None:
-        controls = controls.detach()
         num_steps = controls.shape[1]
-        worlds, order = torch.arange(self.num_worlds), torch.arange(num_steps)
-        # Each world goes through its runs of equal controls; worlds whose runs are equally long go together. A step
-        # that stops at VEL has positions and velocities of the new state, forces of the last physics step, and the
-        # next one continues from there: Batch.rollout would compute these stages twice.
-        last_of_run = torch.ones(self.num_worlds, num_steps, dtype=torch.bool)
-        last_of_run[:, :-1] = (controls[:, 1:] != controls[:, :-1]).any(-1)
-        begin = torch.zeros(self.num_worlds, dtype=torch.int64)
-        while (active := begin < num_steps).any():
-            run = last_of_run & (order >= begin.unsqueeze(-1))
-            end = torch.where(active, run.int().argmax(-1) + 1, begin)
-            self.data("ctrl").copy_(controls[worlds, begin.clamp(max=num_steps - 1)])
-            for length in (end - begin)[active].unique().tolist():
-                ids = (end - begin == length).nonzero().squeeze(-1)
-                self._batch.step(ids.numpy(), nstep=length, stage=mujoco.mjtStage.mjSTAGE_VEL)
-            begin = end
+        if num_steps > self._slots:
+            raise ValueError(f"{num_steps} controls in a step; the model's actuators have room for {self._slots}")
+        self._schedule(slice(None), controls.detach())
+        # A step that stops at VEL has positions and velocities of the new state, forces of the last physics step, and
+        # the next one continues from there: Batch.rollout would compute these stages twice.
+        self._batch.step(nstep=num_steps, stage=mujoco.mjtStage.mjSTAGE_VEL)
+
+    def _schedule(self, worlds: Tensor | slice, controls: Tensor) -> None:
+        """Writes the controls of the next physics steps where delayed actuators will find them. [n, S, nu]"""
+        missing = self._slots - controls.shape[1]
+        plan = torch.cat([controls, controls[:, -1:].expand(-1, missing, -1)], dim=1).double()
+        self.data("ctrl")[worlds] = plan[:, -1]
+        # half a step early, so that rounding cannot choose a neighbour
+        offsets = (torch.arange(self._slots) - 0.5 - self._slots) * self._timestep
+        times = (self.data("time")[worlds].unsqueeze(-1) + offsets).unsqueeze(1).expand(-1, plan.shape[-1], -1)
+        head = torch.tensor([0.0, self._slots - 1.0], dtype=torch.float64)  # the user's value; place of the newest
+        history = torch.cat([head.expand(*times.shape[:2], 2), times, plan.transpose(1, 2)], dim=-1)
+        self.data("history")[worlds] = history.flatten(1)
 
     def reset(self, worlds: Tensor) -> None:
         self._batch.reset(worlds.numpy(), stage=mujoco.mjtStage.mjSTAGE_NONE)
 
     def refresh(self, worlds: Tensor) -> None:
+        self._schedule(worlds, self.data("ctrl")[worlds].unsqueeze(1))
         self._batch.forward(worlds.numpy())
 
     def commit_model(self, worlds: Tensor) -> None:
@@ -139,5 +156,6 @@ class BatchBackend:
     def world(self, index: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         model = self._batch.get_model(index)
         data = self._batch.get_data(index)
+        model.actuator_delay[:] = 0.0
         mujoco.mj_forward(model, data)
         return model, data
