@@ -1,9 +1,27 @@
-"""Resets that cost what the environments that reset cost."""
+"""A transformed environment whose steps and resets cost what they must."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
+
+
+_ENVS_PER_THREAD = 1024
+
+
+@contextmanager
+def _torch_threads(num_envs: int) -> Iterator[None]:
+    """Lowers torch's threads to what tensors of so many rows can use, without changing them for good."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(min(before, -(-num_envs // _ENVS_PER_THREAD)))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class RowResetEnv(TransformedEnv):
@@ -13,9 +31,16 @@ class RowResetEnv(TransformedEnv):
     then costs twice. Here base environment and transforms are given the n rows, with their numbers
     under `worlds` int64 [n], and results are written into copies of the others' tensors. `reset` itself is unchanged.
 
+    Torch's threads wait for work by spinning, on processors that physics wants; while it steps they are therefore
+    limited to one per 1024 environments.
+
     The base environment must have `reset_rows` (see `HumanoidObjectEnv`), and transforms must take the batch size
     from the tensordict.
     """
+
+    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        with _torch_threads(self.base_env.batch_size.numel()):
+            return super().step(tensordict)
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         if not self.any_done(tensordict):
@@ -23,9 +48,10 @@ class RowResetEnv(TransformedEnv):
         worlds = tensordict.get("_reset").reshape(-1).nonzero().squeeze(-1)
         part = tensordict[worlds].set("worlds", worlds)
         tensordict = tensordict.exclude("_reset")
-        part = self.transform._reset_env_preprocess(part)
-        fresh = self.transform._reset(part, self.base_env.reset_rows(part))
-        for key, value in fresh.items(True, True):
-            # out of place: the collector keeps references to the last step's tensors
-            tensordict.set(key, tensordict.get(key).index_copy(0, worlds, value))
+        with _torch_threads(len(worlds)):
+            part = self.transform._reset_env_preprocess(part)
+            fresh = self.transform._reset(part, self.base_env.reset_rows(part))
+            for key, value in fresh.items(True, True):
+                # out of place: the collector keeps references to the last step's tensors
+                tensordict.set(key, tensordict.get(key).index_copy(0, worlds, value))
         return tensordict
