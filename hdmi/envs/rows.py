@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
-
 _ENVS_PER_THREAD = 1024
 
 
