@@ -11,7 +11,7 @@ import torch
 from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
-from torchrl.envs import CatTensors, Compose, RemoveEmptySpecs, SelectTransform, Transform, TransformedEnv
+from torchrl.envs import CatTensors, Compose, RemoveEmptySpecs, SelectTransform, Transform
 
 from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene
 from hdmi.envs import BatchBackend, HumanoidObjectEnv, RowResetEnv
@@ -127,7 +127,7 @@ def make_env(
     task: Task | None = None,
     pixels: tuple[int, int] | None = None,
     backend: Callable[..., Any] | None = None,
-) -> TransformedEnv:
+) -> RowResetEnv:
     """The environment of a config: the base environment under the transforms that `cfg.stack` lists.
 
     Args:

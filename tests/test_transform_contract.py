@@ -138,6 +138,7 @@ CASES: dict[str, Case] = {
     "ReferenceStateInitialization": Case(lazy("ReferenceStateInitialization"), "init", random=True),
     "RelativeJointPos": Case(lambda: T.RelativeJointPos("out"), "function", (("robot", "joint_pos"),)),
     "ResidualAction": Case(T.ResidualAction, "inverse", (("ref", "joint_pos"),)),
+    "RewardRate": Case(lambda: T.RewardRate(0.02), "reward"),
     "SurvivalReward": Case(T.SurvivalReward, "reward"),
     "TrackedBodies": Case(lambda: T.TrackedBodies([".*_knee_link", "pelvis"]), "function", (*ROBOT_BODY, *ROOT)),
     "TrackingReward": Case(
@@ -385,9 +386,11 @@ class TestReplayBuffer:
             sample = buffer.sample()
             for key in transform.out_keys:
                 assert sample.get((*prefix, *([key] if isinstance(key, str) else key))).shape[0] == 6
-            if case.kind == "reward":
+            if isinstance(transform, T.RewardTerm):
                 term = sample.get(("next", *transform.out_keys[0]))
                 torch.testing.assert_close(sample["next", "reward"], 1 + transform.weight * term)
+            if isinstance(transform, T.RewardRate):
+                torch.testing.assert_close(sample["next", "reward"], torch.full((6, 1), 0.02))
 
     @pytest.mark.parametrize("name", names(kind="reward"))
     def test_reward_of_time_batches(self, name):

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
-from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
+from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.utils import KLAdaptiveLR
 from torchrl.objectives.value import GAE
@@ -50,8 +50,10 @@ class Trainer:
         set_threads(cfg.num_threads)
         torch.manual_seed(cfg.seed)
         self.task: Task = make_task(cfg)
-        self.env: TransformedEnv = make_env(cfg, task=self.task)
+        self.env = make_env(cfg, task=self.task)
         self.env.set_seed(cfg.seed)
+        if cfg.compile:
+            self.env.compile_transforms()
         spec = self.env.full_observation_spec
         self.sizes = {
             "policy": spec["policy"].shape[-1],

@@ -272,3 +272,24 @@ class FeetAirTime(RewardTerm):
 
     def function(self, *inputs: Tensor) -> Tensor:
         return F.feet_air_time(*inputs, threshold=self.threshold)
+
+
+class RewardRate(SpecTransform):
+    """Takes the reward for a rate: a control step earns its share of a second. [..., 1]
+
+    TorchRL's RewardScaling does the same, but branches on a tensor, which stops `torch.compile`.
+
+    Args:
+        control_dt: s.
+    """
+
+    def __init__(self, control_dt: float, reward_key: NestedKey = "reward"):
+        super().__init__(in_keys=[reward_key], out_keys=[reward_key])
+        self.control_dt = control_dt
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict.set(self.out_keys[0], self.control_dt * next_tensordict.get(self.in_keys[0]))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Scales the reward of recorded transitions, in their `next`."""
+        return tensordict.copy().set("next", self._step(tensordict, tensordict.get("next").copy()))
