@@ -27,7 +27,7 @@ from rich.table import Table
 from tensordict import TensorDictBase
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
-from hdmi.build import make_transforms
+from hdmi.build import Task, make_env, make_transforms
 from hdmi.learning import Trainer
 
 _BLOCKS, _STEPS, _ITERATIONS = 7, 20, 4
@@ -87,11 +87,14 @@ def step_env(
     return env.base_env.num_envs * count / spent, carry
 
 
-def transform_times(
-    env: TransformedEnv, names: list[str], carry: TensorDictBase, policy: Any, count: int
-) -> dict[str, float]:
-    """Milliseconds per control step that each transform takes, resets included."""
+def transform_times(cfg: DictConfig, task: Task, policy: Any, count: int) -> dict[str, float]:
+    """Milliseconds per control step that each transform takes if it is not compiled, resets included."""
+    names = [name for name, _ in make_transforms(cfg, task)] + ["select outputs", "remove empty specs"]
     spent: dict[str, float] = defaultdict(float)
+    env = make_env(cfg, task=task)
+    with torch.no_grad():
+        carry = env.reset()
+    _, carry = step_env(env, carry, policy, count)
 
     def timed(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
@@ -107,9 +110,6 @@ def transform_times(
         for method in methods:
             object.__setattr__(transform, method, timed(name, getattr(transform, method)))
     step_env(env, carry, policy, count)
-    for transform in env.transform.transforms:
-        for method in methods:
-            object.__delattr__(transform, method)
     return {name: 1e3 * value / count for name, value in spent.items()}
 
 
@@ -129,8 +129,7 @@ def main(cfg: DictConfig) -> None:
             speed, carry = step_env(env, carry, policy, _STEPS, raw)
             env_sps.append(speed)
             raw_sps.append(raw.replay())
-        names = [name for name, _ in make_transforms(cfg, trainer.task)] + ["select outputs", "remove empty specs"]
-        costs = transform_times(env, names, carry, policy, _STEPS)
+        costs = transform_times(cfg, trainer.task, policy, _STEPS)
 
         batches = iter(trainer.collector)
         collect, learn, train, raw_beside = [], [], [], []
@@ -161,7 +160,7 @@ def main(cfg: DictConfig) -> None:
         "num_envs": cfg.num_envs,
         "task": cfg.task.name,
     }
-    table = Table(title="Time per control step by transform, resets included", title_justify="left")
+    table = Table(title="Time per control step by transform, not compiled, resets included", title_justify="left")
     table.add_column("transform")
     table.add_column("ms", justify="right")
     for name, cost in sorted(costs.items(), key=lambda item: -item[1])[:25]:

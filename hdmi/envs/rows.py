@@ -49,8 +49,25 @@ class RowResetEnv(TransformedEnv):
         Args:
             options: of `torch.compile`.
         """
-        self.transform._step = torch.compile(self.transform._step, dynamic=False, **options)
-        self._reset_transforms = torch.compile(self.transform._reset, dynamic=True, **options)
+        step = torch.compile(self.transform._step, dynamic=False, **options)
+        reset = torch.compile(self.transform._reset, dynamic=True, **options)
+
+        # under the same gradient mode whoever steps the environment: another one would be compiled again
+        @torch.no_grad()
+        def compiled_step(tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+            return step(tensordict, next_tensordict)
+
+        @torch.no_grad()
+        def compiled_reset(tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+            # Only the number of rows varies. It must not be tied to sizes and offsets that happen to equal it: copies
+            # have no offsets, and the other sizes are declared fixed.
+            tensordict, tensordict_reset = tensordict.clone(), tensordict_reset.clone()
+            for value in (*tensordict.values(True, True), *tensordict_reset.values(True, True)):
+                torch._dynamo.mark_static(value, list(range(1, value.ndim)))
+            return reset(tensordict, tensordict_reset)
+
+        self.transform._step = compiled_step  # type: ignore[method-assign]
+        self._reset_transforms = compiled_reset  # type: ignore[method-assign]
 
     def _reset_transforms(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self.transform._reset(tensordict, tensordict_reset)

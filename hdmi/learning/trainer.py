@@ -52,8 +52,6 @@ class Trainer:
         self.task: Task = make_task(cfg)
         self.env = make_env(cfg, task=self.task)
         self.env.set_seed(cfg.seed)
-        if cfg.compile:
-            self.env.compile_transforms()
         spec = self.env.full_observation_spec
         self.sizes = {
             "policy": spec["policy"].shape[-1],
@@ -82,6 +80,8 @@ class Trainer:
         self.bad_updates = self.lost_checkpoints = 0
         self.elapsed = 0.0  # s of collection and learning
         self._warm_up()
+        if cfg.compile:
+            self.env.compile_transforms()
         self.collector = Collector(
             self.env,
             self.actor,

@@ -227,7 +227,9 @@ class ActionDelay(_ActionStateTransform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         history = tensordict.get(("delay", "history"))
-        next_tensordict.set(("delay", "history"), tensordict.get("delay_targets")[..., : history.shape[-2], :])
+        next_tensordict.set(
+            ("delay", "history"), tensordict.get("delay_targets")[..., : history.shape[-2], :].contiguous()
+        )
         next_tensordict.set(("delay", "substeps"), tensordict.get(("delay", "substeps")))
         next_tensordict.set(("delay", "fresh"), torch.zeros_like(tensordict.get(("delay", "fresh"))))
         return next_tensordict
