@@ -29,6 +29,9 @@ def main(cfg: DictConfig) -> None:
     except USER_ERRORS as error:
         console.print(f"[red]{type(error).__name__}:[/red] {error}", highlight=False, soft_wrap=True)
         sys.exit(2)
+    if not trainer.ranks.is_first:
+        trainer.run()
+        return
     console.print(describe(make_transforms(cfg, trainer.task)))
     console.print(
         f"task {trainer.task.name}: {trainer.task.reference.num_frames} frames, {cfg.num_envs} environments, "

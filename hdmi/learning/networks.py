@@ -31,11 +31,8 @@ class RunningNorm(nn.Module):
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     @torch.no_grad()
-    def update(self, values: Tensor) -> None:
-        """Adds a batch [..., size] to the moments (parallel-variance formula)."""
-        values = values.reshape(-1, values.shape[-1])
-        n = values.shape[0]
-        mean, var = values.mean(0), values.var(0, unbiased=False)
+    def update(self, mean: Tensor, var: Tensor, n: int) -> None:
+        """Adds n samples of the given mean and population variance [size] (parallel-variance formula)."""
         total = self.count + n
         share = (n / total).to(mean.dtype)
         delta = mean - self.mean

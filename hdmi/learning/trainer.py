@@ -11,6 +11,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
 from torchrl.collectors import Collector
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
@@ -19,6 +21,7 @@ from torchrl.objectives.value import GAE
 
 from hdmi.build import Task, make_env, make_task, set_threads
 from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, rotate, save_checkpoint
+from hdmi.learning.distributed import Ranks
 from hdmi.learning.logger import RunLogger
 from hdmi.learning.networks import observation_norm
 from hdmi.learning.policy import make_networks
@@ -33,7 +36,7 @@ class DivergenceError(RuntimeError):
 
 
 class Trainer:
-    """PPO with an asymmetric critic, on one process.
+    """PPO with an asymmetric critic, on one process or on several under torchrun.
 
     Each iteration collects `frames_per_env` steps of `num_envs` environments, estimates advantages by GAE
     (bootstrapping through truncations), makes `epochs` passes of minibatch updates, and then updates the observation
@@ -46,12 +49,15 @@ class Trainer:
 
     def __init__(self, cfg: DictConfig, folder: Path):
         self.cfg, self.folder = cfg, folder
-        self.device = torch.device(cfg.device)
+        self.ranks = Ranks.from_environment(cfg.device)
+        self.device = torch.device(cfg.device, self.ranks.local_rank) if cfg.device == "cuda" else torch.device("cpu")
+        cfg.num_threads = self.ranks.threads(cfg.num_threads)
         set_threads(cfg.num_threads)
-        torch.manual_seed(cfg.seed)
+        seed = self.ranks.seed(cfg.seed)
+        torch.manual_seed(seed)
         self.task: Task = make_task(cfg)
         self.env = make_env(cfg, task=self.task)
-        self.env.set_seed(cfg.seed)
+        self.env.set_seed(seed)
         spec = self.env.full_observation_spec
         self.sizes = {
             "policy": spec["policy"].shape[-1],
@@ -69,13 +75,14 @@ class Trainer:
             loss_critic_type="smooth_l1",
             normalize_advantage=False,
         )
+        self.objective = _Objective(self.loss) if self.ranks.size == 1 else _parallel(_Objective(self.loss))
         self.gae = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=self.critic, average_gae=False)
         self.actor_optim = torch.optim.Adam(self.actor.parameters(), lr=algo.actor_lr, fused=True)
         self.critic_optim = torch.optim.Adam(self.critic.parameters(), lr=algo.critic_lr, fused=True)
         self.schedule = KLAdaptiveLR(
             self.actor_optim, target_kl=algo.desired_kl, factor=1.2, min_lr=1e-5, max_lr=algo.max_lr
         )
-        self.frames_per_batch = cfg.num_envs * algo.frames_per_env
+        self.frames_per_batch = cfg.num_envs * algo.frames_per_env  # of this rank
         self.iteration = self.frames = 0
         self.bad_updates = self.lost_checkpoints = 0
         self.elapsed = 0.0  # s of collection and learning
@@ -103,8 +110,9 @@ class Trainer:
         self._update_moments(batch)
 
     def _update_moments(self, batch: TensorDictBase) -> None:
-        observation_norm(self.actor).update(batch["policy"])
-        observation_norm(self.critic).update(batch["critic"])
+        for key, network in (("policy", self.actor), ("critic", self.critic)):
+            values = batch[key].reshape(-1, batch[key].shape[-1])
+            observation_norm(network).update(*self.ranks.moments(values), n=len(values) * self.ranks.size)
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """One PPO update on a batch [N, T]; returns losses and statistics."""
@@ -113,7 +121,8 @@ class Trainer:
             self.gae(batch)
         data = batch.select(*_LEARNER_KEYS).reshape(-1)
         advantage = data["advantage"]
-        data["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
+        mean, variance = self.ranks.moments(advantage)
+        data["advantage"] = (advantage - mean) / (variance.sqrt() + 1e-6)
         size = data.shape[0] // algo.minibatches
         sums: dict[str, float] = {}
         count = 0
@@ -136,11 +145,11 @@ class Trainer:
 
     def _step(self, minibatch: TensorDictBase) -> dict[str, float] | None:
         """One gradient step; None, without touching the weights, if loss or gradient is not finite."""
-        losses = self.loss(minibatch)
-        total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+        total, losses = self.objective(minibatch)
         self.actor_optim.zero_grad()
         self.critic_optim.zero_grad()
         total.backward()
+        total, kl = self.ranks.mean(torch.stack([total.detach(), losses["kl_approx"]]))
         norm = self.cfg.algo.max_grad_norm
         actor_norm = torch.nn.utils.clip_grad_norm_(self.actor.parameters(), norm)
         critic_norm = torch.nn.utils.clip_grad_norm_(self.critic.parameters(), norm)
@@ -156,14 +165,13 @@ class Trainer:
         self.bad_updates = 0
         self.actor_optim.step()
         self.critic_optim.step()
-        kl = float(losses["kl_approx"])
-        self.schedule.step(kl)
+        self.schedule.step(float(kl))
         return {
             "loss_actor": float(losses["loss_objective"].detach()),
             "loss_critic": float(losses["loss_critic"].detach()),
             "entropy": float(losses["entropy"]),
             "clip_fraction": float(losses["clip_fraction"]),
-            "kl": kl,
+            "kl": float(kl),
             "grad_norm_actor": float(actor_norm),
         }
 
@@ -172,53 +180,67 @@ class Trainer:
     def run(self) -> None:
         """Trains up to `cfg.total_frames`; an interrupt leaves a checkpoint to resume from.
 
+        Of several ranks the first one logs and writes; interrupted, they leave the last periodic checkpoint.
+
         Raises:
             DivergenceError: if updates stay without finite loss.
             KeyboardInterrupt: after saving.
         """
-        cfg = self.cfg
-        self.folder.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(cfg, self.folder / "config.yaml")
-        logger = RunLogger(self.folder, cfg, self.iteration)
+        cfg, first = self.cfg, self.ranks.is_first
+        if first:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            OmegaConf.save(cfg, self.folder / "config.yaml")
+        logger = RunLogger(self.folder, cfg, self.iteration) if first else None
         batches = iter(self.collector)
         columns = (
             TextColumn("[bold]{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
             TextColumn("{task.fields[numbers]}"),
         )  # fmt: skip
         try:
-            with Progress(*columns, refresh_per_second=2) as progress:
-                total = -(-cfg.total_frames // self.frames_per_batch)
+            with Progress(*columns, refresh_per_second=2, disable=not first) as progress:
+                frames_per_iteration = self.frames_per_batch * self.ranks.size
+                total = -(-cfg.total_frames // frames_per_iteration)
                 bar = progress.add_task(self.task.name, total=total, completed=self.iteration, numbers="")
                 while self.frames < cfg.total_frames:
                     start = time.perf_counter()
                     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
                         batch = next(batches)
                     collected = time.perf_counter()
-                    row = {**summarize(batch), **self.update(batch)}
+                    row = self.ranks.mean_row(
+                        {
+                            **summarize(batch),
+                            **self.update(batch),
+                            "diverged_worlds": self.env.base_env.num_diverged,
+                        }
+                    )
                     end = time.perf_counter()
                     self.elapsed += end - start
                     self.iteration += 1
-                    self.frames += self.frames_per_batch
+                    self.frames += frames_per_iteration
                     row |= {
                         "frames": self.frames,
                         "minutes": self.elapsed / 60,
-                        "collect_sps": self.frames_per_batch / (collected - start),
-                        "learn_sps": self.frames_per_batch / (end - collected),
-                        "train_sps": self.frames_per_batch / (end - start),
-                        "diverged_worlds": self.env.base_env.num_diverged,
+                        "collect_sps": frames_per_iteration / (collected - start),
+                        "learn_sps": frames_per_iteration / (end - collected),
+                        "train_sps": frames_per_iteration / (end - start),
                     }
-                    if cfg.eval_interval and self.iteration % cfg.eval_interval == 0:
+                    if first and cfg.eval_interval and self.iteration % cfg.eval_interval == 0:
                         row |= self._evaluate()
-                    logger.log(self.iteration, row)
+                    if logger is not None:
+                        logger.log(self.iteration, row)
                     progress.update(bar, completed=self.iteration, numbers=_headline(row))
-                    if not progress.console.is_terminal and self.iteration % 10 == 0:
+                    if first and not progress.console.is_terminal and self.iteration % 10 == 0:
                         progress.console.print(f"{self.iteration}/{total} {_headline(row)}", highlight=False)
                     if self.iteration % cfg.checkpoint_interval == 0:
                         self.save()
+                if self.ranks.size > 1:
+                    self.save()
         finally:
-            if self.frames:
+            # ranks that were interrupted in different places cannot save together
+            if self.frames and self.ranks.size == 1:
                 self.save()
-            logger.close()
+            if logger is not None:
+                logger.close()
             self.collector.shutdown()
 
     def _evaluate(self) -> dict[str, float]:
@@ -234,6 +256,17 @@ class Trainer:
         """Writes a checkpoint that resuming continues exactly from; a full disk is reported and counted."""
         # The collector has no public access to the tensordict that it carries from batch to batch.
         carrier = self.collector._carrier
+        ranks = self.ranks.gather(
+            {
+                "rng": torch.get_rng_state(),
+                "env": self.env.base_env.get_state().to_dict(),
+                "num_diverged": self.env.base_env.num_diverged,
+                "transforms": dict(self.env.transform.state_dict()),
+                "carrier": carrier.to_dict(),
+            }
+        )
+        if not self.ranks.is_first:
+            return
         state = {
             "config": OmegaConf.to_container(self.cfg, resolve=True),
             "task": self.task.name,
@@ -245,11 +278,7 @@ class Trainer:
             "critic": self.critic.state_dict(),
             "actor_optim": self.actor_optim.state_dict(),
             "critic_optim": self.critic_optim.state_dict(),
-            "rng": torch.get_rng_state(),
-            "env": self.env.base_env.get_state().to_dict(),
-            "num_diverged": self.env.base_env.num_diverged,
-            "transforms": dict(self.env.transform.state_dict()),
-            "carrier": carrier.to_dict(),
+            "ranks": ranks,
         }
         path = self.folder / "checkpoints" / f"checkpoint_{self.iteration:06d}.pt"
         try:
@@ -263,7 +292,8 @@ class Trainer:
         """Continues from what `save` wrote.
 
         Raises:
-            CheckpointError: for a checkpoint of another task, or of other sizes of observations or actions.
+            CheckpointError: for a checkpoint of another task, of other sizes of observations or actions, or of
+                another number of environments or ranks.
         """
         if state["task"] != self.task.name:
             raise CheckpointError(
@@ -271,22 +301,45 @@ class Trainer:
             )
         if state["sizes"] != self.sizes:
             raise CheckpointError(f"resume: the checkpoint has sizes {state['sizes']}, the config {self.sizes}")
+        if len(state["ranks"]) != self.ranks.size:
+            raise CheckpointError(
+                f"resume: the checkpoint is of {len(state['ranks'])} ranks (torchrun --nproc-per-node), "
+                f"there are {self.ranks.size}"
+            )
+        own = state["ranks"][self.ranks.rank]
         self.actor.load_state_dict(state["actor"])
         self.critic.load_state_dict(state["critic"])
         self.actor_optim.load_state_dict(state["actor_optim"])
         self.critic_optim.load_state_dict(state["critic_optim"])
         self.iteration, self.frames, self.elapsed = state["iteration"], state["frames"], state["elapsed"]
-        carrier = TensorDict(state["carrier"], batch_size=[len(state["carrier"]["done"])])
+        carrier = TensorDict(own["carrier"], batch_size=[len(own["carrier"]["done"])])
         if carrier.batch_size[0] != self.cfg.num_envs:
             raise CheckpointError(
                 f"resume: the checkpoint has {carrier.batch_size[0]} environments, "
                 f"the config num_envs={self.cfg.num_envs}"
             )
-        self.env.base_env.set_state(TensorDict(state["env"]))
-        self.env.base_env.num_diverged = state["num_diverged"]
-        self.env.transform.load_state_dict(state["transforms"])
+        self.env.base_env.set_state(TensorDict(own["env"]))
+        self.env.base_env.num_diverged = own["num_diverged"]
+        self.env.transform.load_state_dict(own["transforms"])
         self.collector._carrier = carrier.to(self.device)
-        torch.set_rng_state(state["rng"].cpu())
+        torch.set_rng_state(own["rng"].cpu())
+
+
+class _Objective(torch.nn.Module):
+    """The loss to descend and its parts, as one module."""
+
+    def __init__(self, loss: ClipPPOLoss):
+        super().__init__()
+        self.loss = loss
+
+    def forward(self, minibatch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+        losses = self.loss(minibatch)
+        return losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"], losses
+
+
+def _parallel(objective: _Objective) -> DistributedDataParallel:
+    # running moments are averaged where they are updated
+    return DistributedDataParallel(objective, broadcast_buffers=False)
 
 
 def summarize(batch: TensorDictBase) -> dict[str, float]:
