@@ -23,8 +23,9 @@ CURVES = {
     "body_error": "body error (m)",
     "contact_rate": "contacts made",
     "eval/success_rate": "success in evaluation",
+    "eval/survival": "survival in evaluation",
 }
-_SHARES = ("episode_completed", "contact_rate", "eval/success_rate")
+_SHARES = ("episode_completed", "contact_rate", "eval/success_rate", "eval/survival")
 _COLOURS = ("#2a6fbb", "#d1603d", "#3a8f5c", "#8a5bb0", "#c29a2b", "#4fa3a5", "#b5477d", "#6b6b6b")
 
 

@@ -34,7 +34,7 @@ class Ranks:
         if not dist.is_torchelastic_launched():
             return cls()
         if not dist.is_initialized():
-            dist.init_process_group("nccl" if device == "cuda" else "gloo")
+            dist.init_process_group("nccl" if device.startswith("cuda") else "gloo")
         local_rank, local_size = (int(os.environ[key]) for key in ("LOCAL_RANK", "LOCAL_WORLD_SIZE"))
         return cls(dist.get_rank(), dist.get_world_size(), local_rank, local_size)
 

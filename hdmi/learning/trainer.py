@@ -50,7 +50,9 @@ class Trainer:
     def __init__(self, cfg: DictConfig, folder: Path):
         self.cfg, self.folder = cfg, folder
         self.ranks = Ranks.from_environment(cfg.device)
-        self.device = torch.device(cfg.device, self.ranks.local_rank) if cfg.device == "cuda" else torch.device("cpu")
+        self.device = torch.device(cfg.device)
+        if self.device.type == "cuda" and self.device.index is None:
+            self.device = torch.device("cuda", self.ranks.local_rank)
         cfg.num_threads = self.ranks.threads(cfg.num_threads)
         set_threads(cfg.num_threads)
         seed = self.ranks.seed(cfg.seed)
