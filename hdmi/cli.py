@@ -33,8 +33,9 @@ def main(cfg: DictConfig) -> None:
         trainer.run()
         return
     console.print(describe(make_transforms(cfg, trainer.task)))
+    ranks = f" on each of {trainer.ranks.size} ranks" if trainer.ranks.size > 1 else ""
     console.print(
-        f"task {trainer.task.name}: {trainer.task.reference.num_frames} frames, {cfg.num_envs} environments, "
+        f"task {trainer.task.name}: {trainer.task.reference.num_frames} frames, {cfg.num_envs} environments{ranks}, "
         f"observations {trainer.sizes}, run folder {folder}",
         soft_wrap=True,
     )
