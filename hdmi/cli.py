@@ -29,9 +29,7 @@ def main(cfg: DictConfig) -> None:
     except USER_ERRORS as error:
         console.print(f"[red]{type(error).__name__}:[/red] {error}", highlight=False, soft_wrap=True)
         sys.exit(2)
-    if not trainer.ranks.is_first:
-        trainer.run()
-        return
+    console.quiet = not trainer.ranks.is_first
     console.print(describe(make_transforms(cfg, trainer.task)))
     ranks = f" on each of {trainer.ranks.size} ranks" if trainer.ranks.size > 1 else ""
     console.print(
@@ -47,7 +45,8 @@ def main(cfg: DictConfig) -> None:
     except DivergenceError as error:
         console.print(f"[red]{type(error).__name__}:[/red] {error}", soft_wrap=True)
         sys.exit(2)
-    finish(cfg, folder, console)
+    if trainer.ranks.is_first:
+        finish(cfg, folder, console)
 
 
 def finish(cfg: DictConfig, folder: Path, console: Console) -> None:

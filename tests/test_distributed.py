@@ -40,9 +40,14 @@ def work(folder: Path) -> None:
 
     trainer = Trainer(config(), folder / "run")
     trainer.run()
-    run = {"weights": weights(trainer), "frames": trainer.frames, "first_draw": trainer.env.base_env.get_state()}
-    run["qpos"] = run.pop("first_draw")["backend", "data/qpos"]
-    torch.save({"stepped": stepped, "run": run}, folder / f"rank{rank}.pt")
+    qpos = trainer.env.base_env.get_state()["backend", "data/qpos"]
+    run = {"weights": weights(trainer), "frames": trainer.frames, "qpos": qpos}
+
+    Trainer(config("total_frames=64"), folder / "half").run()
+    trainer = Trainer(config(f"resume={folder / 'half'}"), folder / "half")
+    trainer.run()
+    resumed = {"weights": weights(trainer), "qpos": trainer.env.base_env.get_state()["backend", "data/qpos"]}
+    torch.save({"stepped": stepped, "run": run, "resumed": resumed}, folder / f"rank{rank}.pt")
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +98,13 @@ def test_the_first_rank_leaves_one_run(ranks: tuple[Path, Trainer, list[dict]]) 
     own = [rank["env"]["backend"]["data/qpos"] for rank in state["ranks"]]
     assert len(own) == 2
     assert not torch.equal(*own)
+
+
+def test_resuming_continues_every_rank(ranks: tuple[Path, Trainer, list[dict]]) -> None:
+    for results in ranks[2]:
+        assert torch.equal(results["resumed"]["qpos"], results["run"]["qpos"])
+        for name, value in results["run"]["weights"].items():
+            assert torch.equal(results["resumed"]["weights"][name], value), name
 
 
 def test_resuming_with_other_ranks_is_refused(ranks: tuple[Path, Trainer, list[dict]]) -> None:

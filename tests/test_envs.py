@@ -108,6 +108,35 @@ class TestRowReset:
         assert (mass[:, box] != before[:, box]).tolist() == [False, False, True, False, False]
 
 
+def test_torch_threads_are_few_while_it_steps_and_as_before_afterwards(monkeypatch: pytest.MonkeyPatch):
+    env, seen = env_of(3), []
+    start = env.reset()
+    backend = env.base_env.backend
+    for name in ("step", "refresh"):
+        method = getattr(backend, name)
+        monkeypatch.setattr(backend, name, lambda x, method=method: (seen.append(torch.get_num_threads()), method(x)))
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        start["done"][1] = True
+        advance(env, env.maybe_reset(start), 1)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [1, 1]
+
+
+def test_forces_after_a_reset_are_those_of_its_own_targets():
+    """A reset holds the joints where they are: whatever was scheduled before is forgotten."""
+    env = env_of(2, *DETERMINISTIC).base_env
+    first = env.reset()["robot", "joint_torque"].clone()
+    action = env.scene.default_qpos[env.scene.joint_qpos]
+    for _ in range(2):
+        env.step(env.rand_action().set("action", torch.from_numpy(action).float().expand(2, -1) + 0.5))
+    torch.testing.assert_close(env.reset()["robot", "joint_torque"], first)
+    assert first.abs().max() < 1e-3
+
+
 def test_compiled_transforms_equal_eager_ones():
     """The whole default stack is one graph, in a step and in a reset of some rows, and computes the same."""
     results = []

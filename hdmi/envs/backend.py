@@ -156,6 +156,6 @@ class BatchBackend:
     def world(self, index: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         model = self._batch.get_model(index)
         data = self._batch.get_data(index)
-        model.actuator_delay[:] = 0.0
+        model.actuator_delay[:] = 0.0  # the schedule is over: forces are those of `ctrl`
         mujoco.mj_forward(model, data)
         return model, data

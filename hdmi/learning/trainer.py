@@ -53,6 +53,7 @@ class Trainer:
         self.device = torch.device(cfg.device)
         if self.device.type == "cuda" and self.device.index is None:
             self.device = torch.device("cuda", self.ranks.local_rank)
+            torch.cuda.set_device(self.device)  # where NCCL exchanges objects
         cfg.num_threads = self.ranks.threads(cfg.num_threads)
         set_threads(cfg.num_threads)
         seed = self.ranks.seed(cfg.seed)
