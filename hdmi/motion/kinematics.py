@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from hdmi.assets import g1
 from hdmi.assets.robot import RobotConfig, add_robot
@@ -62,3 +62,29 @@ def angular_velocity(quat: np.ndarray, fps: float) -> np.ndarray:
     )
     velocity = relative.as_rotvec().reshape(*quat.shape[:-1], 3) * fps
     return velocity / steps.reshape(-1, *([1] * (quat.ndim - 1)))
+
+
+def resampled_times(num_frames: int, fps: float, new_fps: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times of the frames of a motion and of the same motion at another rate, s."""
+    old = np.arange(num_frames) / fps
+    new = np.arange(int(np.floor(old[-1] * new_fps + 1e-6)) + 1) / new_fps
+    return old, np.minimum(new, old[-1])
+
+
+def interpolate(values: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """Linearly, from times `old` to times `new`. [T, ...] -> [T', ...] float32"""
+    before = np.clip(np.searchsorted(old, new, side="right") - 1, 0, len(old) - 2)
+    share = ((new - old[before]) / (old[before + 1] - old[before])).reshape(-1, *([1] * (values.ndim - 1)))
+    return ((1 - share) * values[before] + share * values[before + 1]).astype(np.float32)
+
+
+def interpolate_quat(quat: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """By slerp, from times `old` to times `new`. [T, ..., 4] -> [T', ..., 4] float32"""
+    tracks = quat.reshape(len(quat), -1, 4).swapaxes(0, 1)
+    out = [Slerp(old, Rotation.from_quat(track, scalar_first=True))(new).as_quat(scalar_first=True) for track in tracks]
+    return np.stack(out, axis=1).reshape(len(new), *quat.shape[1:]).astype(np.float32)
+
+
+def nearest_frames(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """Index of the time in `old` that is nearest to each in `new`. [T']"""
+    return np.searchsorted((old[:-1] + old[1:]) / 2, new)

@@ -25,11 +25,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hdmi.motion.check import MotionError, checked, checked_fps, checked_labels, checked_names, checked_quat
 from hdmi.motion.kinematics import angular_velocity, derivative
-
-
-class MotionError(ValueError):
-    """A motion file that cannot be used; the message names file, field and frame."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +53,7 @@ class Motion:
 
 _REQUIRED = {"body_pos_w": 3, "body_quat_w": 4, "joint_pos": None}
 _OPTIONAL = {"body_lin_vel_w": 3, "body_ang_vel_w": 3, "joint_vel": None}
+_BECAUSE = " from meta.json and joint_pos"
 
 
 def load_motion(path: str | Path) -> Motion:
@@ -76,11 +74,9 @@ def load_motion(path: str | Path) -> Motion:
         fps = float(meta["fps"])
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
         raise MotionError(f"{meta_path}: needs body_names, joint_names and fps: {error!r}") from error
-    if not (np.isfinite(fps) and fps > 0):
-        raise MotionError(f"{meta_path}: fps must be positive, got {fps}")
-    for kind, names in (("body_names", body_names), ("joint_names", joint_names)):
-        if not all(isinstance(name, str) for name in names) or len(set(names)) != len(names):
-            raise MotionError(f"{meta_path}: {kind} must be distinct strings")
+    checked_fps(meta_path, fps)
+    body_names = checked_names(meta_path, "body_names", body_names)
+    joint_names = checked_names(meta_path, "joint_names", joint_names)
     try:
         with np.load(npz_path, allow_pickle=False) as file:
             arrays = {key: file[key] for key in file.files}
@@ -97,13 +93,8 @@ def load_motion(path: str | Path) -> Motion:
         if key not in arrays:
             continue
         shape = (num_frames, len(joint_names)) if width is None else (num_frames, len(body_names), width)
-        values[key] = _checked(npz_path, key, arrays[key], shape)
-    norms = np.linalg.norm(values["body_quat_w"].astype(np.float64), axis=-1)
-    if (bad := np.argwhere(np.abs(norms - 1) > 1e-2)).size:
-        t, b = bad[0]
-        raise MotionError(f"{npz_path}: body_quat_w: norm {norms[t, b]:.3f} at frame {t}, body {body_names[b]!r}")
-    norms[np.abs(norms - 1) < 1e-6] = 1.0  # unit as far as float32 can tell: leave the bits alone
-    values["body_quat_w"] = (values["body_quat_w"] / norms[..., None]).astype(np.float32)
+        values[key] = checked(npz_path, key, arrays[key], shape, _BECAUSE)
+    values["body_quat_w"] = checked_quat(npz_path, "body_quat_w", values["body_quat_w"], body_names, "body")
     values.setdefault("body_lin_vel_w", derivative(values["body_pos_w"], fps).astype(np.float32))
     values.setdefault("body_ang_vel_w", angular_velocity(values["body_quat_w"], fps).astype(np.float32))
     values.setdefault("joint_vel", derivative(values["joint_pos"], fps).astype(np.float32))
@@ -111,15 +102,10 @@ def load_motion(path: str | Path) -> Motion:
     if "object_contact" in arrays:
         raw = arrays["object_contact"]
         raw = raw[:, None] if raw.ndim == 1 else raw
-        raw = _checked(npz_path, "object_contact", raw, (num_frames, *raw.shape[1:2]))
-        if (bad := np.argwhere((raw != 0) & (raw != 1))).size:
-            raise MotionError(
-                f"{npz_path}: object_contact: {raw[tuple(bad[0])]} at frame {bad[0][0]} is neither 0 nor 1"
-            )
-        contact = raw.astype(bool)
+        contact = checked_labels(npz_path, "object_contact", raw, (num_frames, *raw.shape[1:2]))
     if "contact_points" in arrays:
         raw = arrays["contact_points"]
-        points = _checked(npz_path, "contact_points", raw, (num_frames, *raw.shape[1:2], 3))
+        points = checked(npz_path, "contact_points", raw, (num_frames, *raw.shape[1:2], 3))
     return Motion(
         name=folder.name,
         fps=fps,
@@ -129,17 +115,6 @@ def load_motion(path: str | Path) -> Motion:
         contact_points=points,
         **values,
     )
-
-
-def _checked(path: Path, key: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    if array.dtype.kind not in "fiub":
-        raise MotionError(f"{path}: {key}: numbers expected, got dtype {array.dtype}")
-    if array.shape != shape:
-        raise MotionError(f"{path}: {key}: shape {array.shape}, expected {shape} from meta.json and joint_pos")
-    array = array.astype(np.float32)
-    if (bad := np.argwhere(~np.isfinite(array))).size:
-        raise MotionError(f"{path}: {key}: not finite at frame {bad[0][0]}, index {tuple(int(i) for i in bad[0][1:])}")
-    return array
 
 
 def save_motion(motion: Motion, path: str | Path) -> Path:

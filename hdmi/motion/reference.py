@@ -9,11 +9,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from hdmi.assets import Effector, ObjectConfig, SceneryConfig, default_joint_pos, g1
-from hdmi.motion.kinematics import angular_velocity, derivative, forward_kinematics
+from hdmi.motion.kinematics import (
+    angular_velocity,
+    derivative,
+    forward_kinematics,
+    interpolate,
+    interpolate_quat,
+    nearest_frames,
+    resampled_times,
+)
 from hdmi.motion.motion import Motion, MotionError, load_motion
 
 _ROOT_JOINT = "root"  # a column that some tools write for the free joint; nothing reads it
@@ -197,32 +204,17 @@ def resample(motion: Motion, fps: float) -> Motion:
     """The motion at another rate: positions and velocities linear, orientations slerp, labels nearest."""
     if abs(motion.fps - fps) < 1e-6:
         return motion
-    old = np.arange(motion.num_frames) / motion.fps
-    new = np.arange(int(np.floor(old[-1] * fps + 1e-6)) + 1) / fps
-    new = np.minimum(new, old[-1])
-
-    def linear(array: np.ndarray) -> np.ndarray:
-        flat = array.reshape(len(array), -1)
-        out = np.stack([np.interp(new, old, column) for column in flat.T], axis=-1)
-        return out.reshape(len(new), *array.shape[1:]).astype(np.float32)
-
-    quat = np.stack(
-        [
-            Slerp(old, Rotation.from_quat(motion.body_quat_w[:, b], scalar_first=True))(new).as_quat(scalar_first=True)
-            for b in range(len(motion.body_names))
-        ],
-        axis=1,
-    ).astype(np.float32)
-    nearest = np.abs(new[:, None] - old[None]).argmin(1)
+    old, new = resampled_times(motion.num_frames, motion.fps, fps)
+    nearest = nearest_frames(old, new)
     sampled: dict[str, Any] = {
-        key: linear(getattr(motion, key))
+        key: interpolate(getattr(motion, key), old, new)
         for key in ("body_pos_w", "body_lin_vel_w", "body_ang_vel_w", "joint_pos", "joint_vel")
     }
     return replace(
         motion,
         fps=fps,
-        body_quat_w=quat,
+        body_quat_w=interpolate_quat(motion.body_quat_w, old, new),
         object_contact=None if motion.object_contact is None else motion.object_contact[nearest],
-        contact_points=None if motion.contact_points is None else linear(motion.contact_points),
+        contact_points=None if motion.contact_points is None else interpolate(motion.contact_points, old, new),
         **sampled,
     )
