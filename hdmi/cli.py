@@ -11,7 +11,7 @@ from omegaconf import DictConfig, open_dict
 from rich.console import Console
 
 from hdmi.build import ConfigError, describe, make_transforms
-from hdmi.learning.checkpoint import CheckpointError
+from hdmi.learning.checkpoint import CheckpointError, checkpoints
 from hdmi.learning.trainer import DivergenceError, Trainer
 from hdmi.motion import MotionError
 
@@ -42,8 +42,8 @@ def main(cfg: DictConfig) -> None:
     except KeyboardInterrupt:
         console.print(f"interrupted; continue with resume={folder}", soft_wrap=True)
         sys.exit(130)
-    except DivergenceError as error:
-        console.print(f"[red]{type(error).__name__}:[/red] {error}", soft_wrap=True)
+    except USER_ERRORS as error:
+        console.print(f"[red]{type(error).__name__}:[/red] {error}", highlight=False, soft_wrap=True)
         sys.exit(2)
     if trainer.ranks.is_first:
         finish(cfg, folder, console)
@@ -66,7 +66,7 @@ def run_folder(cfg: DictConfig) -> Path:
     """The folder of a new run, or the one to continue.
 
     Raises:
-        CheckpointError: if `resume` names a folder without checkpoints.
+        CheckpointError: if a new run would go into the folder of an old one.
     """
     if cfg.resume is not None:
         path = Path(cfg.resume)
@@ -81,4 +81,9 @@ def run_folder(cfg: DictConfig) -> Path:
         name = f"{label}_seed{cfg.seed}"
     with open_dict(cfg):
         cfg.run_name = name
-    return Path(cfg.output_dir) / name
+    folder = Path(cfg.output_dir) / name
+    if checkpoints(folder / "checkpoints"):
+        raise CheckpointError(
+            f"run_name={name}: {folder} holds a run already; continue it with resume={folder} or choose another name"
+        )
+    return folder

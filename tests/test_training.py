@@ -16,8 +16,9 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
+from hdmi.cli import run_folder
 from hdmi.learning import CheckpointError, RunningNorm, Trainer, load_checkpoint, load_policy, save_checkpoint
-from hdmi.learning.checkpoint import checkpoints
+from hdmi.learning.checkpoint import checkpoints, claim
 from hdmi.learning.trainer import DivergenceError
 
 ROOT = Path(__file__).parents[1]
@@ -227,3 +228,20 @@ def test_bad_input_is_one_clear_error(overrides: list[str], expected: str, tmp_p
     text = " ".join(result.stdout.split())
     assert re.search(expected, text), result.stdout + result.stderr
     assert "Traceback" not in result.stdout + result.stderr
+
+
+class TestRunFolder:
+    def test_admits_one_training_at_a_time(self, tmp_path: Path) -> None:
+        trainer = Trainer(config("total_frames=32"), tmp_path)
+        with claim(tmp_path), pytest.raises(CheckpointError, match="another process trains there"):
+            trainer.run()
+        trainer.run()
+        assert checkpoints(tmp_path / "checkpoints")
+
+    def test_of_an_old_run_is_not_used_for_a_new_one(self, trained: tuple[Trainer, Path]) -> None:
+        _, folder = trained
+        cfg = config(f"output_dir={folder.parent}", f"run_name={folder.name}")
+        with pytest.raises(CheckpointError, match="holds a run already"):
+            run_folder(cfg)
+        cfg.resume = str(folder)
+        assert run_folder(cfg) == folder

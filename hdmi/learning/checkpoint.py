@@ -4,16 +4,40 @@ from __future__ import annotations
 
 import os
 import pickle
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock, Timeout
 
 FORMAT = 2
 
 
 class CheckpointError(RuntimeError):
     """A checkpoint that cannot be used; the message names file and cause."""
+
+
+@contextmanager
+def claim(folder: Path) -> Iterator[None]:
+    """Makes a run folder and keeps other trainings out of it; the end of the process, too, sets it free.
+
+    Raises:
+        CheckpointError: if another process trains there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / ".lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise CheckpointError(
+            f"{folder}: another process trains there; wait for it, stop it, or choose another run_name"
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from torchrl.objectives.utils import KLAdaptiveLR
 from torchrl.objectives.value import GAE
 
 from hdmi.build import Task, make_env, make_task, set_threads
-from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, rotate, save_checkpoint
+from hdmi.learning.checkpoint import CheckpointError, claim, load_checkpoint, rotate, save_checkpoint
 from hdmi.learning.distributed import Ranks
 from hdmi.learning.logger import RunLogger
 from hdmi.learning.networks import observation_norm
@@ -110,7 +111,9 @@ class Trainer:
     def _warm_up(self) -> None:
         with torch.no_grad():
             batch = self.env.rollout(_WARMUP_STEPS, self.actor, break_when_any_done=False)
-        self._update_moments(batch)
+            self._update_moments(batch)
+            # The learner once, for nothing: compiled code is guarded by tables of tensordict that its first use fills.
+            self.loss(self.gae(batch).select(*_LEARNER_KEYS).reshape(-1))
 
     def _update_moments(self, batch: TensorDictBase) -> None:
         for key, network in (("policy", self.actor), ("critic", self.critic)):
@@ -186,12 +189,16 @@ class Trainer:
         Of several ranks the first one logs and writes; interrupted, they leave the last periodic checkpoint.
 
         Raises:
+            CheckpointError: if another process trains in the run folder.
             DivergenceError: if updates stay without finite loss.
             KeyboardInterrupt: after saving.
         """
+        with claim(self.folder) if self.ranks.is_first else nullcontext():
+            self._run()
+
+    def _run(self) -> None:
         cfg, first = self.cfg, self.ranks.is_first
         if first:
-            self.folder.mkdir(parents=True, exist_ok=True)
             OmegaConf.save(cfg, self.folder / "config.yaml")
         logger = RunLogger(self.folder, cfg, self.iteration) if first else None
         batches = iter(self.collector)
