@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 from mocks import lift_box, load_config
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 
 from hdmi.build import make_env
-from hdmi.envs import BatchBackend
+from hdmi.envs import BatchBackend, RowResetEnv
 
 DETERMINISTIC = ("+ablation=no_randomization", "reset.state.start=first", "~reset.state.noise")
 
@@ -106,6 +106,17 @@ class TestRowReset:
         env.maybe_reset(start)
         assert torch.equal(mass[:, links], before[:, links])
         assert (mass[:, box] != before[:, box]).tolist() == [False, False, True, False, False]
+
+
+    def test_each_row_gets_its_own_state(self):
+        base = env_of(4, *DETERMINISTIC).base_env
+        env = RowResetEnv(base, Compose())
+        start = env.reset()
+        start["init"] = TensorDict({"root_pos": torch.arange(12.0).view(4, 3)}, batch_size=[4])
+        start["done"][[1, 3]] = True
+        rows = env.maybe_reset(start)["robot", "root_pos"]
+        assert rows[[1, 3]].tolist() == [[3, 4, 5], [9, 10, 11]]
+        torch.testing.assert_close(base.backend.data("qpos")[:, :3].float(), rows)
 
 
 def test_torch_threads_are_few_while_it_steps_and_as_before_afterwards(monkeypatch: pytest.MonkeyPatch):
