@@ -1,0 +1,503 @@
+"""Whole-body inverse kinematics of the robot over a sequence of frames (extra `retarget`: mink and daqp).
+
+Every frame is a weighted least-squares problem over all targets, solved by quadratic programs in a trust region that
+start from the frame before, within joint ranges and the joints' velocity limits:
+
+    min_dq  1/2 sum_k |w_k (J_k dq + e_k)|^2    s.t.  q + dq in [q_min, q_max],  |q + dq - q_before| <= v_max dt,
+                                                      d_c + n_c J_c dq >= 0 for every contact c in reach,  |dq| <= r
+
+A weight says how many units of cost one metre or one radian of error is; what matters is their ratio. Contacts are
+those of the robot with itself, with the floor and with obstacles. The programs always have a solution in exact
+arithmetic: what already penetrates may not go deeper, and is pushed out as a heavily weighted target.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from importlib import import_module
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hdmi.assets import RobotConfig, default_joint_pos, g1
+from hdmi.assets.objects import add_geoms
+from hdmi.assets.robot import WORLD_BIT, add_robot
+
+PLANTED_WEIGHT = (300.0, 100.0)  # per m and per rad: a hundred times what hands and pelvis usually get
+_REACH = 0.04  # distance from which on a contact limits the motion, m
+_PUSH_WEIGHT = 100.0  # per m of penetration
+_NUM_JOINTS = len(g1.JOINT_NAMES)
+
+
+@dataclass(frozen=True)
+class PointTarget:
+    """A point of a body that should be at given places.
+
+    Args:
+        body: name in the robot table.
+        pos: world, m. [T, 3] or [3]
+        weight: per m; one figure, one per frame [T, 1], per world axis [3], or both [T, 3]. Zero: no target there.
+        point: in the body's frame, m.
+        name: under which the residual is reported; the body's if absent.
+    """
+
+    body: str
+    pos: ArrayLike
+    weight: ArrayLike
+    point: Sequence[float] = (0.0, 0.0, 0.0)
+    name: str | None = None
+
+
+@dataclass(frozen=True)
+class OrientationTarget:
+    """An orientation that a body should have.
+
+    Args:
+        body: name in the robot table.
+        quat: wxyz, world. [T, 4] or [4]
+        weight: per rad; as for `PointTarget`, but about the axes of the target's frame.
+        name: under which the residual is reported; `<body> orientation` if absent.
+    """
+
+    body: str
+    quat: ArrayLike
+    weight: ArrayLike
+    name: str | None = None
+
+
+@dataclass(frozen=True)
+class ComTarget:
+    """Where the robot's centre of mass should be: `pos` [T, 3] or [3] in m, weight as for `PointTarget`."""
+
+    pos: ArrayLike
+    weight: ArrayLike
+    name: str = "com"
+
+
+@dataclass(frozen=True)
+class PostureTarget:
+    """Joint angles that resolve what other targets leave open.
+
+    Args:
+        joint_pos: in table order, rad. [T, 29] or [29]
+        weight: per rad; one figure, [T, 1], [29] or [T, 29].
+    """
+
+    joint_pos: ArrayLike
+    weight: ArrayLike
+    name: str = "posture"
+
+
+Target = PointTarget | OrientationTarget | ComTarget | PostureTarget
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A body that the robot may touch but not enter.
+
+    Args:
+        name: not one of the robot's bodies.
+        geoms: in its frame, as those of `hdmi.assets.ObjectConfig`.
+        pos, quat: world. [T, 3] or [3], [T, 4] or [4]
+    """
+
+    name: str
+    geoms: Sequence[Any]
+    pos: ArrayLike
+    quat: ArrayLike
+
+
+@dataclass(frozen=True)
+class IkOptions:
+    """How frames are solved.
+
+    Args:
+        max_iterations: quadratic programs for a frame; the first frame gets `first_iterations`.
+        tolerance: a frame has settled when its last step was smaller, rad and m.
+        damping: of the steps; keeps them finite without moving the solution.
+        max_step: largest trust region: of a joint, and of the root in any direction, in one iteration; rad, m.
+        limit_margin: distance kept from the ends of the joint ranges, rad.
+        velocity_scale: of the joints' velocity limits.
+        self_collision: clearance kept between parts of the robot, m; None: they may pass through each other.
+        floor: height that nothing of the robot may be below, m; None: there is no floor.
+    """
+
+    max_iterations: int = 20
+    first_iterations: int = 300
+    tolerance: float = 1e-4
+    damping: float = 1e-4
+    max_step: float = 0.3
+    limit_margin: float = 0.02
+    velocity_scale: float = 1.0
+    self_collision: float | None = 0.005
+    floor: float | None = None
+
+
+@dataclass(frozen=True)
+class IkResult:
+    """Solved frames and how well they meet their targets."""
+
+    root_pos: np.ndarray  # [T, 3] m
+    root_quat: np.ndarray  # [T, 4] wxyz
+    joint_pos: np.ndarray  # [T, 29] rad, in table order
+    residuals: dict[str, np.ndarray]  # of each target, m or rad (posture: largest joint); NaN without weight. [T]
+    iterations: np.ndarray  # [T]
+    failures: np.ndarray  # frames in which a quadratic program had no solution: they keep the last that had one
+    unsettled: np.ndarray  # frames that were still moving after their last iteration
+
+    @property
+    def qpos(self) -> np.ndarray:
+        """Positions of `robot_model`. [T, 36]"""
+        return np.concatenate([self.root_pos, self.root_quat, self.joint_pos], axis=-1)
+
+
+def planted(body: str, pos: ArrayLike, quat: ArrayLike, active: ArrayLike = True) -> list[Target]:
+    """Targets that hold a body at a pose while `active` (bool [T]), against everything but limits and contacts."""
+    on = np.atleast_1d(np.asarray(active, float))[:, None]
+    return [
+        PointTarget(body, pos, on * PLANTED_WEIGHT[0], name=f"{body} planted"),
+        OrientationTarget(body, quat, on * PLANTED_WEIGHT[1], name=f"{body} planted orientation"),
+    ]
+
+
+def standing(pos: ArrayLike = (0.0, 0.0, g1.ROOT_HEIGHT), yaw: float = 0.0) -> np.ndarray:
+    """The default pose with the pelvis at `pos`, facing `yaw`: where to start from. [36]"""
+    quat = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+    return np.concatenate([np.asarray(pos, float), quat, default_joint_pos()])
+
+
+def solve(
+    targets: Sequence[Target],
+    num_frames: int,
+    fps: float,
+    *,
+    initial: np.ndarray | None = None,
+    obstacles: Sequence[Obstacle] = (),
+    options: IkOptions | None = None,
+    on_frame: Callable[[int], None] | None = None,
+) -> IkResult:
+    """Finds the robot's motion that meets the targets best.
+
+    Args:
+        targets: see their classes.
+        num_frames: T.
+        fps: of the frames, for the velocity limits.
+        initial: where the first frame starts from; standing at the origin if absent. [36]
+        obstacles: what the robot may not enter.
+        options: see the class.
+        on_frame: called with the index of every frame once it is solved.
+
+    Raises:
+        ImportError: if the extra is not installed; says what to install.
+        ValueError: for a body that the robot lacks, two targets of one name, a shape that does not fit, or a value
+            that is not finite where it has weight: names the target and frame.
+    """
+    mink = _require_mink()
+    options = options or IkOptions()
+    model, mocap = _model(options, obstacles)
+    rows = _Rows(model, targets, num_frames)
+    poses = [_obstacle_poses(obstacle, num_frames) for obstacle in obstacles]
+    configuration = mink.Configuration(model, q=standing() if initial is None else np.asarray(initial, float))
+    data = configuration.data
+    bounds = _Bounds(model, options, fps, mink.Constraint)
+    contacts = _Contacts(model, options, mink.Constraint)
+    before: np.ndarray | None = None
+    qpos, iterations = np.empty((num_frames, model.nq)), np.zeros(num_frames, int)
+    failures, unsettled = [], []
+    residuals = {name: np.full(num_frames, np.nan) for name in rows.names}
+    for t in range(num_frames):
+        for i, (pos, quat) in zip(mocap, poses, strict=True):
+            data.mocap_pos[i], data.mocap_quat[i] = pos[t], quat[t]
+        rows.frame, settled = t, False
+        bounds.set_window(before)
+        configuration.update()
+        cost = contacts.find(data) + rows.measure(data)
+        for _ in range(options.first_iterations if t == 0 else options.max_iterations):
+            iterations[t] += 1
+            try:
+                step = mink.solve_ik(
+                    configuration, [rows, contacts], 1.0, "daqp", options.damping, limits=[bounds, contacts]
+                )
+            except mink.NoSolutionFound:
+                failures.append(t)
+                break
+            size, start = np.abs(step).max(), configuration.q
+            configuration.integrate_inplace(step, 1.0)
+            found = contacts.find(data) + rows.measure(data)
+            if found <= cost * (1 + 1e-9) + 1e-12:
+                cost = found
+                bounds.radius = min(2 * bounds.radius, options.max_step)
+            else:
+                configuration.update(start)
+                contacts.find(data), rows.measure(data)
+                bounds.radius = size = size / 4
+            if size < options.tolerance:
+                settled = True
+                break
+        if not settled:
+            unsettled.append(t)
+        qpos[t] = before = configuration.q
+        for name, value in rows.errors(data).items():
+            residuals[name][t] = value
+        if on_frame is not None:
+            on_frame(t)
+    return IkResult(
+        root_pos=qpos[:, :3],
+        root_quat=qpos[:, 3:7],
+        joint_pos=qpos[:, 7:],
+        residuals=residuals,
+        iterations=iterations,
+        failures=np.array(failures, int),
+        unsettled=np.array(unsettled, int),
+    )
+
+
+def _require_mink() -> Any:
+    try:
+        import_module("daqp")
+        return import_module("mink")
+    except ImportError as error:
+        raise ImportError(
+            f"inverse kinematics needs {error.name}, which is not installed: pip install 'hdmi[retarget]'"
+        ) from error
+
+
+def _model(options: IkOptions, obstacles: Sequence[Obstacle]) -> tuple[mujoco.MjModel, list[int]]:
+    """The robot, the floor and the obstacles as mocap bodies; and the obstacles' mocap indices."""
+    if not obstacles:
+        return _bare_model(options.self_collision is not None, options.floor), []
+    spec = _spec(options.self_collision is not None, options.floor)
+    for obstacle in obstacles:
+        if obstacle.name in g1.BODY_NAMES:
+            raise ValueError(f"obstacle {obstacle.name!r}: is the name of a body of the robot")
+        body = spec.worldbody.add_body(name=obstacle.name, mocap=True)
+        add_geoms(spec, body, obstacle.geoms, mass=None, friction=1.0, rgba=(0.5, 0.5, 0.5, 1.0))
+    model = _with_reach(spec.compile())
+    return model, [int(model.body(obstacle.name).mocapid[0]) for obstacle in obstacles]
+
+
+@lru_cache(maxsize=4)
+def _bare_model(self_collisions: bool, floor: float | None) -> mujoco.MjModel:
+    return _with_reach(_spec(self_collisions, floor).compile())
+
+
+def _spec(self_collisions: bool, floor: float | None) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    add_robot(spec, RobotConfig(self_collisions=self_collisions))
+    if floor is not None:
+        spec.worldbody.add_geom(
+            name="floor",
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=[1.0, 1.0, 1.0],
+            pos=[0.0, 0.0, floor],
+            contype=WORLD_BIT,
+            conaffinity=WORLD_BIT | 1,
+        )
+    return spec
+
+
+def _with_reach(model: mujoco.MjModel) -> mujoco.MjModel:
+    model.geom_margin[:] = _REACH
+    return model
+
+
+def _obstacle_poses(obstacle: Obstacle, num_frames: int) -> tuple[np.ndarray, np.ndarray]:
+    return (
+        _per_frame(f"obstacle {obstacle.name!r}: pos", obstacle.pos, num_frames, 3),
+        _per_frame(f"obstacle {obstacle.name!r}: quat", obstacle.quat, num_frames, 4),
+    )
+
+
+def _per_frame(where: str, value: ArrayLike, num_frames: int, width: int) -> np.ndarray:
+    array = np.asarray(value, float)
+    try:
+        return np.broadcast_to(array, (num_frames, width))
+    except ValueError:
+        raise ValueError(f"{where}: shape {array.shape} does not fit {num_frames} frames of {width}") from None
+
+
+@dataclass
+class _Row:
+    """A target, checked: values [T, W] and weights [T, D]."""
+
+    name: str
+    kind: type
+    body: int
+    point: np.ndarray
+    value: np.ndarray
+    weight: np.ndarray
+
+
+class _Rows:
+    """All targets as one stacked task; what `mink.solve_ik` asks of a task is `compute_qp_residual`."""
+
+    def __init__(self, model: mujoco.MjModel, targets: Sequence[Target], num_frames: int):
+        self._model = model
+        self._rows = [_checked(model, target, num_frames) for target in targets]
+        self.names = [row.name for row in self._rows]
+        if len(set(self.names)) < len(self.names):
+            twice = sorted({name for name in self.names if self.names.count(name) > 1})
+            raise ValueError(f"targets: {twice} occur more than once; give them names")
+        self.frame = 0
+        self._active: list[tuple[_Row, np.ndarray]] = []
+        self._errors = np.zeros(0)  # weighted, with their sign turned
+        self._joints = np.eye(model.nv)[6:]
+
+    def measure(self, data: mujoco.MjData) -> float:
+        """Cost of the present positions in this frame."""
+        self._active = [(row, row.weight[self.frame]) for row in self._rows if row.weight[self.frame].any()]
+        errors = [-weight * self._error(row, data) for row, weight in self._active]
+        self._errors = np.concatenate(errors) if errors else np.zeros(0)
+        return float(self._errors @ self._errors)
+
+    def compute_qp_residual(self, configuration: Any) -> tuple[np.ndarray, np.ndarray, float]:
+        """Weighted Jacobian [R, nv], the errors last measured [R], and no further damping."""
+        jacobians = [weight[:, None] * self._jacobian(row, configuration.data) for row, weight in self._active]
+        return np.vstack([np.zeros((0, self._model.nv)), *jacobians]), self._errors, 0.0
+
+    def errors(self, data: mujoco.MjData) -> dict[str, float]:
+        """Of each target that has weight in this frame: distance in m or angle in rad, along the weighted axes."""
+        out = {}
+        for row in self._rows:
+            if (weighted := row.weight[self.frame] > 0).any():
+                error = self._error(row, data)[weighted]
+                out[row.name] = float(np.abs(error).max() if row.kind is PostureTarget else np.linalg.norm(error))
+        return out
+
+    def _error(self, row: _Row, data: mujoco.MjData) -> np.ndarray:
+        value = row.value[self.frame]
+        if row.kind is PointTarget:
+            return data.xpos[row.body] + data.xmat[row.body].reshape(3, 3) @ row.point - value
+        if row.kind is ComTarget:
+            return data.subtree_com[row.body] - value
+        if row.kind is PostureTarget:
+            return data.qpos[7 : 7 + _NUM_JOINTS] - value
+        error = np.empty(3)
+        mujoco.mju_subQuat(error, data.xquat[row.body], value)
+        return error
+
+    def _jacobian(self, row: _Row, data: mujoco.MjData) -> np.ndarray:
+        if row.kind is PostureTarget:
+            return self._joints
+        jac = np.zeros((3, self._model.nv))
+        if row.kind is ComTarget:
+            mujoco.mj_jacSubtreeCom(self._model, data, jac, row.body)
+            return jac
+        rotation = data.xmat[row.body].reshape(3, 3)
+        if row.kind is PointTarget:
+            mujoco.mj_jac(self._model, data, jac, None, data.xpos[row.body] + rotation @ row.point, row.body)
+            return jac
+        mujoco.mj_jacBody(self._model, data, None, jac, row.body)
+        return rotation.T @ jac
+
+
+def _checked(model: mujoco.MjModel, target: Target, num_frames: int) -> _Row:
+    body, point = 1, np.zeros(3)  # the pelvis: all of the robot is below it
+    if isinstance(target, PointTarget | OrientationTarget):
+        if target.body not in g1.BODY_NAMES:
+            raise ValueError(f"target: the robot has no body {target.body!r}; it has {', '.join(g1.BODY_NAMES)}")
+        body = model.body(target.body).id
+    if isinstance(target, PointTarget):
+        name, value, width, point = target.name or target.body, target.pos, 3, np.asarray(target.point, float)
+    elif isinstance(target, OrientationTarget):
+        name, value, width = target.name or f"{target.body} orientation", target.quat, 4
+    elif isinstance(target, ComTarget):
+        name, value, width = target.name, target.pos, 3
+    else:
+        name, value, width = target.name, target.joint_pos, _NUM_JOINTS
+    where = f"target {name!r}"
+    values = _per_frame(where, value, num_frames, width)
+    weights = _per_frame(f"{where}: weight", target.weight, num_frames, 3 if width == 4 else width)
+    if not (np.isfinite(weights) & (weights >= 0)).all():
+        raise ValueError(f"{where}: weight: must be finite and not negative")
+    weighted = (weights > 0).any(axis=1)
+    bad = weighted & ~np.isfinite(values).all(axis=1)
+    if width == 4:
+        norms = np.linalg.norm(values, axis=1, keepdims=True)
+        bad |= weighted & ~(norms[:, 0] > 1e-6)
+        values = values / np.where(norms > 1e-6, norms, 1.0)
+    if bad.any():
+        raise ValueError(f"{where}: frame {int(np.argmax(bad))}: value is not finite or has no direction")
+    return _Row(name, type(target), body, point, values, weights)
+
+
+class _Bounds:
+    """Joint ranges, velocity limits against the frame before, and the longest step, as one limit."""
+
+    def __init__(self, model: mujoco.MjModel, options: IkOptions, fps: float, constraint: Any):
+        low, high = np.array(g1.JOINT_RANGES).T
+        self._low, self._high = low + options.limit_margin, high - options.limit_margin
+        speeds = np.array([joint.velocity_limit for joint in g1.JOINTS])
+        self._reach = options.velocity_scale * speeds / fps
+        self.radius = options.max_step
+        self._matrix = np.vstack([np.eye(model.nv), -np.eye(model.nv)])
+        self._window = self._low, self._high
+        self._constraint = constraint
+
+    def set_window(self, before: np.ndarray | None) -> None:
+        """Bounds the joints to what they reach from the frame before; None: the first frame."""
+        if before is not None:
+            joints = before[7 : 7 + _NUM_JOINTS]
+            low, high = joints - self._reach, joints + self._reach
+            self._window = (
+                np.maximum(self._low, np.minimum(low, self._high)),
+                np.minimum(self._high, np.maximum(high, self._low)),
+            )
+
+    def compute_qp_inequalities(self, configuration: Any, dt: float) -> Any:
+        del dt  # steps, not velocities
+        joints = configuration.data.qpos[7 : 7 + _NUM_JOINTS]
+        low, high = self._window
+        root = np.full(6, self.radius)
+        up = np.clip(high - joints, -self.radius, self.radius)
+        down = np.clip(joints - low, -self.radius, self.radius)
+        return self._constraint(G=self._matrix, h=np.concatenate([root, up, root, down]))
+
+
+@dataclass
+class _Contacts:
+    """Contacts in reach: a limit on approaching, and a task that pushes out what penetrates."""
+
+    model: mujoco.MjModel
+    options: IkOptions
+    constraint: Any
+    _gaps: np.ndarray = field(default_factory=lambda: np.zeros(0))  # [C] m
+    _normals: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # [C, nv] of the gap by the positions
+
+    def find(self, data: mujoco.MjData) -> float:
+        """Looks for contacts at the present positions; returns the cost of those that penetrate."""
+        mujoco.mj_collision(self.model, data)
+        gaps, normals = [], []
+        for contact in data.contact[: data.ncon]:
+            first, second = self.model.geom_bodyid[contact.geom]
+            normal = np.zeros(self.model.nv)
+            for body, sign in ((first, -1.0), (second, 1.0)):
+                jac = np.zeros((3, self.model.nv))
+                mujoco.mj_jac(self.model, data, jac, None, contact.pos, body)
+                normal += sign * (contact.frame[:3] @ jac)
+            if normal.any():  # not obstacle against floor
+                clearance = self.options.self_collision or 0.0
+                gaps.append(contact.dist - (clearance if self._is_self(first, second) else 0.0))
+                normals.append(normal)
+        self._gaps, self._normals = np.array(gaps), np.array(normals).reshape(-1, self.model.nv)
+        return float((_PUSH_WEIGHT * np.minimum(self._gaps, 0.0)) @ (_PUSH_WEIGHT * np.minimum(self._gaps, 0.0)))
+
+    def _is_self(self, first: int, second: int) -> bool:
+        robot = range(1, 1 + len(g1.BODY_NAMES))
+        return first in robot and second in robot
+
+    def compute_qp_inequalities(self, configuration: Any, dt: float) -> Any:
+        del configuration, dt
+        if not len(self._gaps):
+            return self.constraint()
+        return self.constraint(G=-self._normals, h=np.maximum(self._gaps, 0.0))
+
+    def compute_qp_residual(self, configuration: Any) -> tuple[np.ndarray, np.ndarray, float]:
+        del configuration
+        inside = self._gaps < 0
+        return _PUSH_WEIGHT * self._normals[inside], -_PUSH_WEIGHT * self._gaps[inside], 0.0
