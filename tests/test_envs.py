@@ -107,7 +107,6 @@ class TestRowReset:
         assert torch.equal(mass[:, links], before[:, links])
         assert (mass[:, box] != before[:, box]).tolist() == [False, False, True, False, False]
 
-
     def test_each_row_gets_its_own_state(self):
         base = env_of(4, *DETERMINISTIC).base_env
         env = RowResetEnv(base, Compose())

@@ -19,6 +19,7 @@ from tensordict import TensorDict
 
 from hdmi.build import ConfigError, make_env
 from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy, protocol, render_checkpoint, video
+from hdmi.evaluation.agents import BlindAgent
 from hdmi.evaluation.options import parse_options, parse_terminations
 from hdmi.evaluation.protocol import FirstEpisodes, StartAtFrame, evaluation_config, termination_names
 from hdmi.learning.checkpoint import CheckpointError, save_checkpoint
@@ -271,6 +272,15 @@ def test_an_agent_is_evaluated_without_a_checkpoint(tmp_path: Path, capsys: pyte
     assert 0 <= figures["success_rate"]["mean"] <= 1
     # it stands and moves as the reference asks its servos to
     assert figures["body_error"]["mean"] < 0.1
+
+
+def test_blind_agents():
+    batch = TensorDict({}, batch_size=[64])
+    assert not BlindAgent("zero", 5)(batch)["action"].any()
+    action = BlindAgent("random", 5)(batch)["action"]
+    assert action.shape == (64, 5)
+    assert -1 <= action.min() < -0.8
+    assert 0.8 < action.max() <= 1
 
 
 @pytest.mark.parametrize("agent", ["zero", "random", "reference"])

@@ -41,7 +41,9 @@ class RunningNorm(nn.Module):
         self.count.copy_(total)
 
     def forward(self, values: Tensor) -> Tensor:
-        return ((values - self.mean) / (self.var.sqrt() + 1e-2)).clamp(-self.clip, self.clip)
+        scale = 1 / (self.var.sqrt() + 1e-2)
+        # one pass over the batch instead of two
+        return torch.addcmul(-self.mean * scale, values, scale).clamp(-self.clip, self.clip)
 
 
 class _Network(nn.Module):

@@ -135,7 +135,9 @@ class Trainer:
         for _ in range(algo.epochs):
             order = torch.randperm(data.shape[0], device=data.device)
             for m in range(algo.minibatches):
-                losses = self._step(data[order[m * size : (m + 1) * size]])
+                rows = order[m * size : (m + 1) * size]
+                # twice as fast as indexing on a CPU
+                losses = self._step(data.apply(lambda x, rows=rows: x.index_select(0, rows), batch_size=rows.shape))
                 if losses is None:
                     continue
                 count += 1
