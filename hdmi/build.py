@@ -95,27 +95,34 @@ def _dataclass(cls: type, node: Any, where: str) -> Any:
     return cls(**values)
 
 
+def scene_parts(cfg: DictConfig) -> dict[str, Any]:
+    """What a config says of the scene: `robot`, `object`, `scenery` and `effectors`, as keyword arguments.
+
+    Raises:
+        ConfigError: for a node that cannot be used.
+    """
+    task = cfg.task
+    return {
+        "robot": _dataclass(RobotConfig, cfg.robot, "robot"),
+        "object": None if task.object is None else build(task.object, "task.object"),
+        "scenery": [build(item, f"task.scenery[{i}]") for i, item in enumerate(task.scenery)],
+        "effectors": [build(item, f"task.effectors[{i}]") for i, item in enumerate(task.effectors)],
+    }
+
+
 def make_task(cfg: DictConfig) -> Task:
     """Loads the reference and compiles the scene of a config.
 
     Raises:
         ConfigError, MotionError: for a node or a motion that cannot be used.
     """
-    robot = _dataclass(RobotConfig, cfg.robot, "robot")
+    parts = scene_parts(cfg)
+    robot = parts.pop("robot")
     sim = _dataclass(SimConfig, cfg.sim, "sim")
     task = cfg.task
-    object_ = None if task.object is None else build(task.object, "task.object")
-    scenery = [build(item, f"task.scenery[{i}]") for i, item in enumerate(task.scenery)]
-    effectors = [build(item, f"task.effectors[{i}]") for i, item in enumerate(task.effectors)]
-    reference = make_reference(
-        find_motion(task.motion, cfg.motion_root),
-        control_dt=sim.control_dt,
-        object=object_,
-        scenery=scenery,
-        effectors=effectors,
-    )
+    reference = make_reference(find_motion(task.motion, cfg.motion_root), control_dt=sim.control_dt, **parts)
     try:
-        scene = build_scene(robot, sim, object_, scenery, effectors, reference.placements)
+        scene = build_scene(robot, sim, **parts, placements=reference.placements)
     except ValueError as error:
         raise ConfigError(f"task {task.name!r}: {error}") from error
     return Task(task.name, scene, reference)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import torch
 from hydra import compose, initialize_config_dir
@@ -18,8 +21,20 @@ from hdmi.build import Task, make_task
 from hdmi.transforms.common import spec_like
 
 CONF = Path(__file__).parents[1] / "conf"
+_SCRIPTS = Path(__file__).parents[1] / "scripts"
 
 Script = Mapping[NestedKey, Tensor]
+
+
+def load_script(name: str) -> ModuleType:
+    """A script as a module, to call its `main`."""
+    spec = importlib.util.spec_from_file_location(f"script_{name}", _SCRIPTS / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
 
 
 class ScriptedEnv(EnvBase):

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 
 import imageio.v2 as imageio
 import pytest
 import torch
 from mocks import lift_box, load_config
+from mocks import load_script as script
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 
@@ -25,21 +24,10 @@ from hdmi.evaluation.protocol import FirstEpisodes, StartAtFrame, evaluation_con
 from hdmi.learning.checkpoint import CheckpointError, save_checkpoint
 from hdmi.learning.policy import make_networks
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
 FIGURES = (
     "success_rate", "survival", "joint_error", "body_error", "root_pos_error", "root_ori_error", "object_pos_error",
     "object_ori_error", "contact_rate",
 )  # fmt: skip
-
-
-def script(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"script_{name}", SCRIPTS / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
 
 
 def after(

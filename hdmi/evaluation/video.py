@@ -18,7 +18,6 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
-from hdmi.assets import Scene
 from hdmi.build import Task, make_task
 from hdmi.envs.rendering import WorldRenderer
 from hdmi.evaluation.protocol import (
@@ -29,7 +28,7 @@ from hdmi.evaluation.protocol import (
     run_folder_of,
     termination_names,
 )
-from hdmi.motion import Reference
+from hdmi.motion import reference_qpos
 
 SIZE = (480, 640)  # height, width
 AFTER_FAILURE = 1.0  # s that are still shown
@@ -112,18 +111,6 @@ def replay(task: Task, start: int = 0) -> Iterator[Moment]:
         data.qpos[:] = reference_qpos(task.scene, task.reference, frame)
         mujoco.mj_forward(model, data)
         yield Moment(model, data, frame)
-
-
-def reference_qpos(scene: Scene, reference: Reference, frame: int) -> np.ndarray:
-    """MuJoCo's generalised positions of a frame of the reference. [nq]"""
-    qpos = scene.default_qpos.copy()
-    qpos[:3], qpos[3:7] = reference.body_pos[frame, 0], reference.body_quat[frame, 0]
-    qpos[scene.joint_qpos] = reference.joint_pos[frame]
-    if (q := scene.object_free_qpos) is not None:
-        qpos[q : q + 3], qpos[q + 3 : q + 7] = reference.object_pos[frame], reference.object_quat[frame]
-    if (q := scene.object_hinge_qpos) is not None:
-        qpos[q] = reference.object_joint_pos[frame, 0]
-    return qpos
 
 
 # -- what is drawn --------------------------------------------------------------------------------------------

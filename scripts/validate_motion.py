@@ -1,0 +1,69 @@
+"""Says whether a motion is worth training on: good, usable or bad, why, and in which frames.
+
+    python scripts/validate_motion.py PATH [task=NAME] [--json]
+
+PATH is a motion's folder. `task` describes the object, the scenery and the end effectors; without it the task whose
+motion has the folder's name is taken, and `task=none` looks at the robot alone. `--json` prints the report as JSON.
+The exit status is 0 for a good or usable motion, 1 for a bad one or one that cannot be read, 2 for wrong arguments.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from hdmi.build import ConfigError, scene_parts
+from hdmi.cli import USER_ERRORS
+from hdmi.evaluation.agents import CONF, task_config
+from hdmi.evaluation.options import parse_options
+from hdmi.motion import MotionError, load_motion
+from hdmi.motion.validate import Report, unreadable, validate_motion
+
+
+@dataclass
+class Options:
+    """See the module."""
+
+    task: str | None = None
+
+
+def report_on(path: Path, task: str | None) -> Report:
+    """Validates the motion in a folder in the scene of a task."""
+    name = path.resolve().name
+    if task is None:
+        task = name if (CONF / "task" / f"{name}.yaml").is_file() else "none"
+    parts = {} if task == "none" else scene_parts(task_config(task))
+    try:
+        motion = load_motion(path)
+    except MotionError as error:
+        return unreadable(name, error)
+    return validate_motion(motion, **parts)
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the script; returns its exit status."""
+    if arguments in (["-h"], ["--help"]):
+        print(__doc__)
+        return 0
+    as_json = "--json" in arguments
+    paths = [argument for argument in arguments if argument != "--json" and "=" not in argument]
+    try:
+        if len(paths) != 1:
+            raise ConfigError(f"give one motion folder, got {paths or 'none'}")
+        options = parse_options(Options, [argument for argument in arguments if "=" in argument])
+        report = report_on(Path(paths[0]), options.task)
+    except (*USER_ERRORS, OSError) as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 2
+    if as_json:
+        print(report.to_json())
+    else:
+        report.print(Console() if sys.stdout.isatty() else Console(width=150))
+    return 0 if report.verdict != "bad" else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
