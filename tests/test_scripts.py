@@ -24,18 +24,26 @@ def test_benchmark_ends_with_its_figures_as_json(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_lift_box_reference_is_what_its_script_makes(tmp_path: Path) -> None:
-    import numpy as np
-
+def test_author_writes_a_motion_that_its_task_takes(tmp_path: Path) -> None:
     from hdmi.motion import load_motion
 
-    command = [sys.executable, str(ROOT / "scripts" / "make_lift_box.py"), "--out", str(tmp_path / "lift_box")]
-    result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=200)
+    plan = tmp_path / "hold.yaml"
+    plan.write_text(
+        "duration: 0.3\ncorrections: 0\nobject: {path: [{at: 0, pos: [0.35, 0, 0.78]}]}\n"
+        "scenery: {stand: {pos: [0.35, 0, 0.34]}}\n"
+    )
+    command = [sys.executable, str(ROOT / "scripts" / "author.py"), "task=lift_box", f"plan={plan}", f"out={tmp_path}"]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=200)
     assert result.returncode == 0, result.stderr
-    made, shipped = load_motion(tmp_path / "lift_box"), load_motion(ROOT / "hdmi/motion/references/lift_box")
-    assert made.body_names == shipped.body_names
-    np.testing.assert_allclose(made.joint_pos, shipped.joint_pos, atol=1e-3)
-    np.testing.assert_array_equal(made.object_contact, shipped.object_contact)
+    assert "15 frames" in result.stdout
+    motion = load_motion(tmp_path / "hold")
+    assert motion.body_names == ("pelvis", "box", "stand")
+    assert motion.object_contact is not None
+    assert motion.object_contact.shape == (15, 2)
+    plan.write_text("duration: 0.3\nhands: {left: [{at: soon}]}\n")
+    refused = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=200)
+    assert refused.returncode == 2
+    assert f"{plan}: hands.left[0].at: no phase 'soon'" in refused.stderr
 
 
 def test_adaptive_starts_count_the_terminations_of_the_whole_stack() -> None:

@@ -214,6 +214,7 @@ def solve(
             data.mocap_pos[i], data.mocap_quat[i] = pos[t], quat[t]
         rows.frame, settled = t, False
         bounds.set_window(before)
+        bounds.radius = options.max_step  # not that of the frame before: a step that it cuts short has not settled
         configuration.update()
         cost = contacts.find(data) + rows.measure(data)
         for _ in range(options.first_iterations if t == 0 else options.max_iterations):
