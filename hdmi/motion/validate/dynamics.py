@@ -109,18 +109,19 @@ class _Solver:
         """
         if not generators.size:
             return needed
-        weight, target = self.row_weight, needed
+        weight, target = self.row_weight.copy(), needed.copy()
         dofs, effort = self.playback.scene.joint_dof, np.array(g1.EFFORT_LIMITS)
-        for _attempt in range(2):
+        held = np.zeros(len(dofs), bool)
+        while True:
             forces, _ = nnls(weight[:, None] * generators, weight * target, maxiter=1000)
             left = needed - generators @ forces
             torque = left[dofs]
-            beyond = np.abs(torque) > effort
+            beyond = (np.abs(torque) > effort) & ~held
             if not beyond.any():
                 break
-            weight, target = weight.copy(), target.copy()
             weight[dofs[beyond]] *= _HOLD
             target[dofs[beyond]] -= np.sign(torque[beyond]) * effort[beyond]
+            held |= beyond
         return left
 
     def _generators(self, t: int) -> np.ndarray:

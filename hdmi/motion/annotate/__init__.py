@@ -1,0 +1,30 @@
+"""From a robot motion and an object to a reference: the object's trajectory, contact labels and contact points.
+
+annotated = annotate_motion(motion, object=box, effectors=hands, overrides=load_overrides("annotation.yaml"))
+"""
+
+from hdmi.motion.annotate.annotate import Agreement, agreement, annotate_motion, complete_object
+from hdmi.motion.annotate.contacts import ContactCriteria, Contacts, contact_points, find_contacts, intervals
+from hdmi.motion.annotate.overrides import FILE, Interval, Overrides, load_overrides
+from hdmi.motion.annotate.surface import Surface, object_surfaces
+from hdmi.motion.annotate.trajectory import complete_hinge, complete_trajectory
+
+__all__ = [
+    "FILE",
+    "Agreement",
+    "ContactCriteria",
+    "Contacts",
+    "Interval",
+    "Overrides",
+    "Surface",
+    "agreement",
+    "annotate_motion",
+    "complete_hinge",
+    "complete_object",
+    "complete_trajectory",
+    "contact_points",
+    "find_contacts",
+    "intervals",
+    "load_overrides",
+    "object_surfaces",
+]
