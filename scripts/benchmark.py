@@ -2,13 +2,16 @@
 
 `python scripts/benchmark.py [any option of train.py]`. Nothing else should run on the machine. Figures are control
 steps per second; blocks of the measurements alternate and medians are reported, so that the ratios hold even where the
-machine's speed drifts. The last line of the output is one JSON object.
+machine's speed drifts. Beside them stand other environments on the CPU (see conf/benchmark.yaml). The last line of
+the output is one JSON object.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import statistics
+import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -27,7 +30,9 @@ from rich.table import Table
 from tensordict import TensorDictBase
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
+from hdmi.assets import Scene
 from hdmi.build import Task, make_env, make_transforms
+from hdmi.evaluation.comparison import mjlab_speed, mujoco_env_speed
 from hdmi.learning import Trainer
 
 _BLOCKS, _STEPS, _ITERATIONS = 7, 20, 4
@@ -113,7 +118,40 @@ def transform_times(cfg: DictConfig, task: Task, policy: Any, count: int) -> dic
     return {name: 1e3 * value / count for name, value in spent.items()}
 
 
-@hydra.main(config_path="../conf", config_name="config", version_base="1.3")
+def compare(options: DictConfig, scene: Scene) -> dict[str, float]:
+    """Control steps per second of other environments: TorchRL's on the same scene, mjlab's on its own."""
+    workers = options.mujoco_env_workers or os.cpu_count() or 1
+    speeds = {
+        "mujoco_env_sps": mujoco_env_speed(scene, 1, options.steps),
+        "mujoco_parallel_env_sps": mujoco_env_speed(scene, workers, options.steps),
+    }
+    if options.mjlab is not None:
+        try:
+            speeds["mjlab_tracking_sps"] = mjlab_speed(options.mjlab, options.mjlab_envs, options.steps)
+        except RuntimeError as error:
+            print(error, file=sys.stderr)
+    return speeds
+
+
+def part_times(result: dict[str, Any]) -> Table:
+    """Where the time of a control step of all worlds goes, from what the parts reach alone."""
+    n = 1e3 * result["num_envs"]
+    physics, env, collect = (n / result[f"{key}_sps"] for key in ("raw_physics", "env", "collect"))
+    parts = {
+        "physics": physics,
+        "transforms, resets and reading": env - physics,
+        "policy and collector": collect - env,
+        "update": n / result["learn_sps"],
+    }
+    table = Table(title="Time per control step by part", title_justify="left")
+    table.add_column("part")
+    table.add_column("ms", justify="right")
+    for name, value in (parts | {"all": n / result["train_sps"]}).items():
+        table.add_row(name, f"{value:.1f}")
+    return table
+
+
+@hydra.main(config_path="../conf", config_name="benchmark", version_base="1.3")
 def main(cfg: DictConfig) -> None:
     console = Console()
     with tempfile.TemporaryDirectory() as folder:
@@ -131,12 +169,10 @@ def main(cfg: DictConfig) -> None:
             raw_sps.append(raw.replay())
         costs = transform_times(cfg, trainer.task, policy, _STEPS)
 
-        batches = iter(trainer.collector)
         collect, learn, train, raw_beside = [], [], [], []
         for i in range(_ITERATIONS + 1):
             start = time.perf_counter()
-            with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-                batch = next(batches)
+            batch = trainer.collector.next()
             middle = time.perf_counter()
             trainer.update(batch)
             end = time.perf_counter()
@@ -147,6 +183,7 @@ def main(cfg: DictConfig) -> None:
                 train.append(frames / (end - start))
                 raw_beside.append(raw.replay())
         trainer.collector.shutdown()
+        others = compare(cfg.compare, trainer.task.scene)
 
     median = statistics.median
     result = {
@@ -159,6 +196,7 @@ def main(cfg: DictConfig) -> None:
         "train_ratio": median(t / r for t, r in zip(train, raw_beside, strict=True)),
         "num_envs": cfg.num_envs,
         "task": cfg.task.name,
+        **others,
     }
     table = Table(title="Time per control step by transform, not compiled, resets included", title_justify="left")
     table.add_column("transform")
@@ -168,6 +206,7 @@ def main(cfg: DictConfig) -> None:
     table.add_row(f"all {len(costs)}", f"{sum(costs.values()):.3f}")
     console.print(table)
     step_ms = 1e3 * cfg.num_envs / result["env_sps"]
+    console.print(part_times(result))
     console.print(f"one control step of {cfg.num_envs} worlds with everything on: {step_ms:.1f} ms")
     print(json.dumps({key: round(v, 4) if isinstance(v, float) else v for key, v in result.items()}))
 

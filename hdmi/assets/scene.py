@@ -63,6 +63,7 @@ class Scene:
     """A compiled scene and where its parts are in MuJoCo's arrays."""
 
     model: mujoco.MjModel
+    xml: str  # MJCF of the model, for other programs
     sim: SimConfig
     effectors: tuple[Effector, ...]
     default_qpos: np.ndarray  # [nq] standing robot, object where it was placed
@@ -136,6 +137,7 @@ def build_scene(
     body = None if object is None else model.body(object.name).id
     return Scene(
         model=model,
+        xml=spec.to_xml(),
         sim=sim,
         effectors=tuple(effectors),
         default_qpos=default_qpos,
