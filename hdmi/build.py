@@ -68,6 +68,8 @@ def build(node: Any, where: str, **context: Any) -> Any:
         raise ConfigError(f"{where}: {cls.__name__} has no {sorted(unknown)}; it takes {sorted(parameters)}")
     try:
         return cls(**kwargs)
+    except ConfigError:  # of a node of its own
+        raise
     except (TypeError, ValueError, KeyError) as error:
         raise ConfigError(f"{where} ({cls.__name__}): {error}") from error
 

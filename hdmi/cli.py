@@ -12,11 +12,12 @@ from rich.console import Console
 
 from hdmi.build import ConfigError, describe, make_transforms
 from hdmi.learning.checkpoint import CheckpointError, checkpoints
+from hdmi.learning.collectors import WorkerError
 from hdmi.learning.trainer import DivergenceError, Trainer
 from hdmi.motion import MotionError
 
 # What a user can put right: shown as one line, without a traceback.
-USER_ERRORS = (ConfigError, MotionError, CheckpointError, DivergenceError, FileNotFoundError)
+USER_ERRORS = (ConfigError, MotionError, CheckpointError, DivergenceError, WorkerError, FileNotFoundError)
 
 
 def main(cfg: DictConfig) -> None:

@@ -26,6 +26,7 @@ OBSERVED = {"observation.policy.object_pose", "noise.object_position", "noise.ob
 POINTS = {"observation.policy.contact_points", "noise.contact_points", "noise.contact_points_episode"}
 # nodes that an ablation takes out, and those that it changes
 EXPECTED: dict[str, tuple[set[str], set[str]]] = {
+    "full": (set(), set()),
     "no_contact_observation": (POINTS | {"observation.policy.contact_labels"}, set()),
     "no_interaction_reward": ({"reward.interaction"}, set()),
     "no_interaction_reward_no_contact_termination": ({"reward.interaction", "termination.lost_contact"}, set()),

@@ -56,7 +56,7 @@ def ranks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trainer, list
     folder = tmp_path_factory.mktemp("ranks")
     alone = Trainer(config("num_envs=8", *ONE_STEP), folder / "alone")
     with torch.no_grad():
-        batch = next(iter(alone.collector)).select(*OBSERVED)
+        batch = alone.collector.next().select(*OBSERVED)
     halves = [batch[:4].contiguous().to_dict(), batch[4:].contiguous().to_dict()]
     torch.save(
         {"actor": alone.actor.state_dict(), "critic": alone.critic.state_dict(), "halves": halves}, folder / "given.pt"

@@ -7,12 +7,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from test_training import TINY
+
 ROOT = Path(__file__).parents[1]
 
 
 def test_benchmark_ends_with_its_figures_as_json(tmp_path: Path) -> None:
     options = ["num_envs=4", "algo.frames_per_env=4", "algo.bf16=false", "num_threads=1", "logger=csv"]
-    command = [sys.executable, str(ROOT / "scripts" / "benchmark.py"), *options]
+    others = ["compare.mujoco_env_workers=1", "compare.steps=5", "compare.mjlab=/nonexistent/python"]
+    command = [sys.executable, str(ROOT / "scripts" / "benchmark.py"), *options, *others]
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=200)
     assert result.returncode == 0, result.stderr
     figures = json.loads(result.stdout.strip().splitlines()[-1])
@@ -20,8 +26,36 @@ def test_benchmark_ends_with_its_figures_as_json(tmp_path: Path) -> None:
     assert figures["task"] == "lift_box"
     assert 0 < figures["train_sps"] < figures["raw_physics_sps"]
     assert 0 < figures["env_ratio"] < 1
+    assert figures["mujoco_env_sps"] > 0
+    assert "mjlab_tracking_sps" not in figures
+    assert "/nonexistent/python" in result.stderr
     assert "tracking.bodies" in result.stdout
+    assert "transforms, resets and reading" in result.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+def test_sweep_runs_as_jobs(tmp_path: Path) -> None:
+    pytest.importorskip("submitit")
+    sweep = ["-m", "hydra/launcher=submitit_local", "+ablation=full,no_rsi", "seed=3"]
+    folders = [f"hydra.sweep.dir={tmp_path / 'sweep'}", f"output_dir={tmp_path / 'runs'}"]
+    command = [sys.executable, str(ROOT / "train.py"), *sweep, *TINY, *folders]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=200)
+    assert result.returncode == 0, result.stderr
+    runs = {folder.name.split("_", 2)[2]: folder for folder in (tmp_path / "runs").iterdir()}
+    assert set(runs) == {"full_seed3", "no_rsi_seed3"}
+    for folder in runs.values():
+        assert "success_rate" in json.loads((folder / "eval.json").read_text())
+    starts = {name: OmegaConf.load(folder / "config.yaml").reset.state.start for name, folder in runs.items()}
+    assert starts == {"full_seed3": "uniform", "no_rsi_seed3": "first"}
+    assert len(list((tmp_path / "sweep" / ".submitit").glob("*/*_0_result.pkl"))) == 2
+
+
+def test_slurm_launcher_is_submitit_s() -> None:
+    pytest.importorskip("submitit")
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        cfg = compose("config", overrides=["hydra/launcher=slurm"], return_hydra_config=True)
+    assert cfg.hydra.launcher._target_.endswith(".SlurmLauncher")
+    assert cfg.hydra.launcher.cpus_per_task == 16
 
 
 def test_author_writes_a_motion_that_its_task_takes(tmp_path: Path) -> None:
@@ -47,8 +81,6 @@ def test_author_writes_a_motion_that_its_task_takes(tmp_path: Path) -> None:
 
 
 def test_adaptive_starts_count_the_terminations_of_the_whole_stack() -> None:
-    from hydra import compose, initialize_config_dir
-
     from hdmi.build import make_env
     from hdmi.transforms import AdaptiveStateInitialization
 

@@ -11,16 +11,14 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
-from torchrl.collectors import Collector
-from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.utils import KLAdaptiveLR
 from torchrl.objectives.value import GAE
 
-from hdmi.build import Task, make_env, make_task, set_threads
+from hdmi.build import Task, build, make_task, set_threads
 from hdmi.learning.checkpoint import CheckpointError, claim, load_checkpoint, rotate, save_checkpoint
 from hdmi.learning.distributed import Ranks
 from hdmi.learning.logger import RunLogger
@@ -60,7 +58,8 @@ class Trainer:
         seed = self.ranks.seed(cfg.seed)
         torch.manual_seed(seed)
         self.task: Task = make_task(cfg)
-        self.env = make_env(cfg, task=self.task)
+        self.collector = build(cfg.collector, "collector", cfg=cfg, task=self.task, seed=seed)
+        self.env = self.collector.env
         self.env.set_seed(seed)
         spec = self.env.full_observation_spec
         self.sizes = {
@@ -91,18 +90,7 @@ class Trainer:
         self.bad_updates = self.lost_checkpoints = 0
         self.elapsed = 0.0  # s of collection and learning
         self._warm_up()
-        if cfg.compile:
-            self.env.compile_transforms()
-        self.collector = Collector(
-            self.env,
-            self.actor,
-            frames_per_batch=self.frames_per_batch,
-            total_frames=-1,
-            trust_policy=True,
-            return_same_td=True,
-            track_traj_ids=False,
-            auto_register_policy_transforms=False,  # nothing in the policy is recurrent
-        )
+        self.collector.start(self.actor)
         if cfg.resume is not None:
             self.restore(load_checkpoint(cfg.resume, self.device))
 
@@ -110,7 +98,9 @@ class Trainer:
 
     def _warm_up(self) -> None:
         with torch.no_grad():
-            batch = self.env.rollout(_WARMUP_STEPS, self.actor, break_when_any_done=False)
+            batch = self.env.rollout(_WARMUP_STEPS, self.actor, break_when_any_done=False, auto_cast_to_device=True).to(
+                self.device
+            )
             self._update_moments(batch)
             # The learner once, for nothing: compiled code is guarded by tables of tensordict that its first use fills.
             self.loss(self.gae(batch).select(*_LEARNER_KEYS).reshape(-1))
@@ -193,6 +183,7 @@ class Trainer:
         Raises:
             CheckpointError: if another process trains in the run folder.
             DivergenceError: if updates stay without finite loss.
+            WorkerError: if a worker of the collector is gone; the last periodic checkpoint stays.
             KeyboardInterrupt: after saving.
         """
         with claim(self.folder) if self.ranks.is_first else nullcontext():
@@ -203,7 +194,6 @@ class Trainer:
         if first:
             OmegaConf.save(cfg, self.folder / "config.yaml")
         logger = RunLogger(self.folder, cfg, self.iteration) if first else None
-        batches = iter(self.collector)
         columns = (
             TextColumn("[bold]{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
             TextColumn("{task.fields[numbers]}"),
@@ -215,16 +205,9 @@ class Trainer:
                 bar = progress.add_task(self.task.name, total=total, completed=self.iteration, numbers="")
                 while self.frames < cfg.total_frames:
                     start = time.perf_counter()
-                    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-                        batch = next(batches)
+                    batch = self.collector.next()
                     collected = time.perf_counter()
-                    row = self.ranks.mean_row(
-                        {
-                            **summarize(batch),
-                            **self.update(batch),
-                            "diverged_worlds": self.env.base_env.num_diverged,
-                        }
-                    )
+                    row = self.ranks.mean_row({**summarize(batch), **self.update(batch)})
                     end = time.perf_counter()
                     self.elapsed += end - start
                     self.iteration += 1
@@ -248,12 +231,14 @@ class Trainer:
                 if self.ranks.size > 1:
                     self.save()
         finally:
-            # ranks that were interrupted in different places cannot save together
-            if self.frames and self.ranks.size == 1:
-                self.save()
-            if logger is not None:
-                logger.close()
-            self.collector.shutdown()
+            try:
+                # ranks that were interrupted in different places cannot save together
+                if self.frames and self.ranks.size == 1:
+                    self.save()
+            finally:
+                if logger is not None:
+                    logger.close()
+                self.collector.shutdown()
 
     def _evaluate(self) -> dict[str, float]:
         from hdmi.evaluation import evaluate_policy  # evaluation depends on learning, not the other way round
@@ -265,18 +250,11 @@ class Trainer:
     # -- checkpoints ------------------------------------------------------------------------------------------
 
     def save(self) -> None:
-        """Writes a checkpoint that resuming continues exactly from; a full disk is reported and counted."""
-        # The collector has no public access to the tensordict that it carries from batch to batch.
-        carrier = self.collector._carrier
-        ranks = self.ranks.gather(
-            {
-                "rng": torch.get_rng_state(),
-                "env": self.env.base_env.get_state().to_dict(),
-                "num_diverged": self.env.base_env.num_diverged,
-                "transforms": dict(self.env.transform.state_dict()),
-                "carrier": carrier.to_dict(),
-            }
-        )
+        """Writes a checkpoint to continue from; a full disk is reported and counted.
+
+        The learner continues exactly; so does the collection as far as its collector does.
+        """
+        ranks = self.ranks.gather({"rng": torch.get_rng_state(), **self.collector.state_dict()})
         if not self.ranks.is_first:
             return
         state = {
@@ -305,7 +283,7 @@ class Trainer:
 
         Raises:
             CheckpointError: for a checkpoint of another task, of other sizes of observations or actions, or of
-                another number of environments or ranks.
+                another number of environments, workers or ranks.
         """
         if state["task"] != self.task.name:
             raise CheckpointError(
@@ -324,16 +302,7 @@ class Trainer:
         self.actor_optim.load_state_dict(state["actor_optim"])
         self.critic_optim.load_state_dict(state["critic_optim"])
         self.iteration, self.frames, self.elapsed = state["iteration"], state["frames"], state["elapsed"]
-        carrier = TensorDict(own["carrier"], batch_size=[len(own["carrier"]["done"])])
-        if carrier.batch_size[0] != self.cfg.num_envs:
-            raise CheckpointError(
-                f"resume: the checkpoint has {carrier.batch_size[0]} environments, "
-                f"the config num_envs={self.cfg.num_envs}"
-            )
-        self.env.base_env.set_state(TensorDict(own["env"]))
-        self.env.base_env.num_diverged = own["num_diverged"]
-        self.env.transform.load_state_dict(own["transforms"])
-        self.collector._carrier = carrier.to(self.device)
+        self.collector.load_state_dict(own)
         torch.set_rng_state(own["rng"].cpu())
 
 
@@ -371,6 +340,7 @@ def summarize(batch: TensorDictBase) -> dict[str, float]:
     causes = after.get("termination", None)
     for name, value in () if causes is None else causes.items():
         row[f"termination/{name}"] = float((value & done).sum()) / ended
+    row["diverged_worlds"] = int(after["diverged"].sum())
     row["episode_completed"] = float(after["completed"].sum()) / ended
     row["episodes"] = int(done.sum())
     if done.any():
