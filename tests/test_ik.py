@@ -117,6 +117,14 @@ def test_nothing_enters_floor_obstacle_or_itself(stop: bool):
         assert gap < -0.02  # what the limits are for
 
 
+def test_smoothing_takes_jerk_out_of_a_noisy_target():
+    places = np.random.default_rng(0).normal([0.25, 0.2, 0.85], 0.01, (30, 3))
+    targets = [*feet(), PointTarget("left_wrist_yaw_link", places, 10.0), STAY]
+    rough, smooth = (ik.solve(targets, 30, FPS, options=IkOptions(smoothing=s)).joint_pos for s in (0.0, 10.0))
+    jerk = [np.sqrt((np.diff(joints, n=3, axis=0) ** 2).mean()) for joints in (rough, smooth)]
+    assert jerk[1] < 0.5 * jerk[0]
+
+
 def test_frames_without_weight_have_no_residual():
     weight = np.array([[10.0], [0.0]])
     result = ik.solve([PointTarget("pelvis", [0.0, 0.0, 0.7], weight), STAY], 2, FPS)

@@ -30,7 +30,10 @@ from hdmi.assets.robot import WORLD_BIT, add_robot
 PLANTED_WEIGHT = (300.0, 100.0)  # per m and per rad: a hundred times what hands and pelvis usually get
 _REACH = 0.04  # distance from which on a contact limits the motion, m
 _PUSH_WEIGHT = 100.0  # per m of penetration
+_PERSISTENCE = 0.8  # of speed from one frame to the next, where nothing else decides
+_STALLED = 1e-5  # a frame has settled, too, when a step lowers its cost by a smaller share
 _NUM_JOINTS = len(g1.JOINT_NAMES)
+_ROBOT = range(1, 1 + len(g1.BODY_NAMES))  # body ids
 
 
 @dataclass(frozen=True)
@@ -117,11 +120,12 @@ class IkOptions:
 
     Args:
         max_iterations: quadratic programs for a frame; the first frame gets `first_iterations`.
-        tolerance: a frame has settled when its last step was smaller, rad and m.
+        tolerance: a frame has settled when its last step was smaller, rad and m, or its cost hardly fell.
         damping: of the steps; keeps them finite without moving the solution.
         max_step: largest trust region: of a joint, and of the root in any direction, in one iteration; rad, m.
         limit_margin: distance kept from the ends of the joint ranges, rad.
         velocity_scale: of the joints' velocity limits.
+        smoothing: weight per rad, of going on at the joints' present speed.
         self_collision: clearance kept between parts of the robot, m; None: they may pass through each other.
         floor: height that nothing of the robot may be below, m; None: there is no floor.
     """
@@ -133,6 +137,7 @@ class IkOptions:
     max_step: float = 0.3
     limit_margin: float = 0.02
     velocity_scale: float = 1.0
+    smoothing: float = 0.0
     self_collision: float | None = 0.005
     floor: float | None = None
 
@@ -145,6 +150,7 @@ class IkResult:
     root_quat: np.ndarray  # [T, 4] wxyz
     joint_pos: np.ndarray  # [T, 29] rad, in table order
     residuals: dict[str, np.ndarray]  # of each target, m or rad (posture: largest joint); NaN without weight. [T]
+    penetration: dict[str, np.ndarray]  # deepest, into "floor", obstacles and "robot" (itself), m. [T]
     iterations: np.ndarray  # [T]
     failures: np.ndarray  # frames in which a quadratic program had no solution: they keep the last that had one
     unsettled: np.ndarray  # frames that were still moving after their last iteration
@@ -199,7 +205,7 @@ def solve(
     mink = _require_mink()
     options = options or IkOptions()
     model, mocap = _model(options, obstacles)
-    rows = _Rows(model, targets, num_frames)
+    rows = _Rows(model, targets, num_frames, options.smoothing)
     poses = [_obstacle_poses(obstacle, num_frames) for obstacle in obstacles]
     configuration = mink.Configuration(model, q=standing() if initial is None else np.asarray(initial, float))
     data = configuration.data
@@ -209,14 +215,20 @@ def solve(
     qpos, iterations = np.empty((num_frames, model.nq)), np.zeros(num_frames, int)
     failures, unsettled = [], []
     residuals = {name: np.full(num_frames, np.nan) for name in rows.names}
+    penetration = {name: np.zeros(num_frames) for name in contacts.others}
+
+    def measure() -> float:
+        return contacts.find(data) + rows.measure(data)
+
     for t in range(num_frames):
         for i, (pos, quat) in zip(mocap, poses, strict=True):
             data.mocap_pos[i], data.mocap_quat[i] = pos[t], quat[t]
         rows.frame, settled = t, False
         bounds.set_window(before)
-        bounds.radius = options.max_step  # not that of the frame before: a step that it cuts short has not settled
+        if t > 0:
+            rows.expected = qpos[t - 1, 7:] + _PERSISTENCE * (qpos[t - 1, 7:] - qpos[max(t - 2, 0), 7:])
         configuration.update()
-        cost = contacts.find(data) + rows.measure(data)
+        cost = measure()
         for _ in range(options.first_iterations if t == 0 else options.max_iterations):
             iterations[t] += 1
             try:
@@ -228,22 +240,25 @@ def solve(
                 break
             size, start = np.abs(step).max(), configuration.q
             configuration.integrate_inplace(step, 1.0)
-            found = contacts.find(data) + rows.measure(data)
+            found = measure()
             if found <= cost * (1 + 1e-9) + 1e-12:
+                settled = cost - found < _STALLED * cost
                 cost = found
                 bounds.radius = min(2 * bounds.radius, options.max_step)
             else:
                 configuration.update(start)
-                contacts.find(data), rows.measure(data)
+                measure()
                 bounds.radius = size = size / 4
-            if size < options.tolerance:
-                settled = True
+            settled = settled or size < options.tolerance
+            if settled:
                 break
         if not settled:
             unsettled.append(t)
         qpos[t] = before = configuration.q
         for name, value in rows.errors(data).items():
             residuals[name][t] = value
+        for name, depth in contacts.depths(data).items():
+            penetration[name][t] = max(penetration[name][t], depth)
         if on_frame is not None:
             on_frame(t)
     return IkResult(
@@ -251,6 +266,7 @@ def solve(
         root_quat=qpos[:, 3:7],
         joint_pos=qpos[:, 7:],
         residuals=residuals,
+        penetration=penetration,
         iterations=iterations,
         failures=np.array(failures, int),
         unsettled=np.array(unsettled, int),
@@ -337,14 +353,15 @@ class _Row:
 class _Rows:
     """All targets as one stacked task; what `mink.solve_ik` asks of a task is `compute_qp_residual`."""
 
-    def __init__(self, model: mujoco.MjModel, targets: Sequence[Target], num_frames: int):
-        self._model = model
+    def __init__(self, model: mujoco.MjModel, targets: Sequence[Target], num_frames: int, smoothing: float):
+        self._model, self._smoothing = model, smoothing
         self._rows = [_checked(model, target, num_frames) for target in targets]
         self.names = [row.name for row in self._rows]
         if len(set(self.names)) < len(self.names):
             twice = sorted({name for name in self.names if self.names.count(name) > 1})
             raise ValueError(f"targets: {twice} occur more than once; give them names")
         self.frame = 0
+        self.expected: np.ndarray | None = None  # joints, if they went on as they move; None: at the start. [29]
         self._active: list[tuple[_Row, np.ndarray]] = []
         self._errors = np.zeros(0)  # weighted, with their sign turned
         self._joints = np.eye(model.nv)[6:]
@@ -353,13 +370,21 @@ class _Rows:
         """Cost of the present positions in this frame."""
         self._active = [(row, row.weight[self.frame]) for row in self._rows if row.weight[self.frame].any()]
         errors = [-weight * self._error(row, data) for row, weight in self._active]
+        if self._smooths:
+            errors.append(-self._smoothing * (data.qpos[7 : 7 + _NUM_JOINTS] - self.expected))
         self._errors = np.concatenate(errors) if errors else np.zeros(0)
         return float(self._errors @ self._errors)
 
     def compute_qp_residual(self, configuration: Any) -> tuple[np.ndarray, np.ndarray, float]:
         """Weighted Jacobian [R, nv], the errors last measured [R], and no further damping."""
         jacobians = [weight[:, None] * self._jacobian(row, configuration.data) for row, weight in self._active]
+        if self._smooths:
+            jacobians.append(self._smoothing * self._joints)
         return np.vstack([np.zeros((0, self._model.nv)), *jacobians]), self._errors, 0.0
+
+    @property
+    def _smooths(self) -> bool:
+        return self._smoothing > 0 and self.expected is not None
 
     def errors(self, data: mujoco.MjData) -> dict[str, float]:
         """Of each target that has weight in this frame: distance in m or angle in rad, along the weighted axes."""
@@ -435,6 +460,7 @@ class _Bounds:
         self._low, self._high = low + options.limit_margin, high - options.limit_margin
         speeds = np.array([joint.velocity_limit for joint in g1.JOINTS])
         self._reach = options.velocity_scale * speeds / fps
+        self._max_step = options.max_step
         self.radius = options.max_step
         self._matrix = np.vstack([np.eye(model.nv), -np.eye(model.nv)])
         self._window = self._low, self._high
@@ -442,6 +468,7 @@ class _Bounds:
 
     def set_window(self, before: np.ndarray | None) -> None:
         """Bounds the joints to what they reach from the frame before; None: the first frame."""
+        self.radius = self._max_step  # not that of the frame before: a step that it cuts short has not settled
         if before is not None:
             joints = before[7 : 7 + _NUM_JOINTS]
             low, high = joints - self._reach, joints + self._reach
@@ -489,8 +516,26 @@ class _Contacts:
         return float((_PUSH_WEIGHT * np.minimum(self._gaps, 0.0)) @ (_PUSH_WEIGHT * np.minimum(self._gaps, 0.0)))
 
     def _is_self(self, first: int, second: int) -> bool:
-        robot = range(1, 1 + len(g1.BODY_NAMES))
-        return first in robot and second in robot
+        return first in _ROBOT and second in _ROBOT
+
+    @property
+    def others(self) -> list[str]:
+        """What the robot can touch, itself included."""
+        names = [self.model.body(i).name for i in range(len(g1.BODY_NAMES) + 1, self.model.nbody)]
+        names += ["floor"] if self.options.floor is not None else []
+        return names + (["robot"] if self.options.self_collision is not None else [])
+
+    def depths(self, data: mujoco.MjData) -> dict[str, float]:
+        """How deep the robot is in what it touches, at the contacts last found, m."""
+        out: dict[str, float] = {}
+        for contact in data.contact[: data.ncon]:
+            bodies = self.model.geom_bodyid[contact.geom]
+            if not any(body in _ROBOT for body in bodies):
+                continue
+            other = next((int(body) for body in bodies if body not in _ROBOT), None)
+            name = "robot" if other is None else self.model.body(other).name if other else "floor"
+            out[name] = max(out.get(name, 0.0), -float(contact.dist))
+        return out
 
     def compute_qp_inequalities(self, configuration: Any, dt: float) -> Any:
         del configuration, dt

@@ -1,0 +1,138 @@
+"""The object in the robot's scene, and hands that keep their place on it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from hdmi.assets import GeomConfig, ObjectConfig
+from hdmi.assets.objects import load_mesh
+from hdmi.motion.annotate.surface import object_surfaces
+from hdmi.motion.human import ObjectTrajectory
+from hdmi.motion.ik import Obstacle
+
+# The hand's collision capsule: its ends from the palm's point, in the hand's frame, and its radius, m.
+_HAND = np.array([[-0.01, 0.0, 0.0], [0.07, 0.0, 0.0]])
+_HAND_RADIUS = 0.035
+_NEAR, _FAR = 0.05, 0.30  # m; a hand nearer to the object belongs to it, one farther to the body
+_RAMP = 0.1  # s, over which a labelled contact takes hold of a hand
+
+Poses = dict[str, tuple[np.ndarray, Rotation]]
+
+
+def object_poses(config: ObjectConfig, trajectory: ObjectTrajectory) -> Poses:
+    """Positions [T, 3] and orientations of the object's body and, if it is articulated, of its link, by name."""
+    pos, base = trajectory.pos.astype(float), Rotation.from_quat(trajectory.quat.astype(float), scalar_first=True)
+    if config.hinge is None:
+        return {config.name: (pos, base)}
+    angle = np.zeros(len(pos)) if trajectory.joint_pos is None else trajectory.joint_pos.astype(float)
+    axis = np.asarray(config.hinge.axis, float)
+    turn = Rotation.from_rotvec(angle[:, None] * axis / np.linalg.norm(axis))
+    link = base * Rotation.from_quat(config.hinge.quat, scalar_first=True) * turn
+    return {config.name: (pos, base), config.link: (pos + base.apply(config.hinge.pos), link)}
+
+
+def obstacles(config: ObjectConfig, trajectory: ObjectTrajectory) -> list[Obstacle]:
+    """The object's bodies as something the robot may not enter."""
+    poses = object_poses(config, trajectory)
+    return [
+        Obstacle(name, surface.geoms, poses[name][0], poses[name][1].as_quat(scalar_first=True))
+        for name, surface in object_surfaces(config).items()
+    ]
+
+
+def scale_object(trajectory: ObjectTrajectory, scale: float, config: ObjectConfig | None) -> ObjectTrajectory:
+    """The object in the scaled scene: its orientation and size stay, its place and its height above ground scale.
+
+    Heights are those of its lowest point, so that what stands on the ground still does; without geometry, those above
+    the lowest of the trajectory. What is fixed in the world keeps its height.
+    """
+    pos = trajectory.pos.astype(float)
+    if config is None:
+        above = pos[:, 2] - pos[:, 2].min()
+    else:
+        above = np.zeros(len(pos)) if config.fixed_base else np.maximum(lowest_point(config, trajectory), 0.0)
+    scaled = np.column_stack([scale * pos[:, :2], pos[:, 2] + (scale - 1) * above])
+    return ObjectTrajectory(trajectory.name, scaled.astype(np.float32), trajectory.quat, trajectory.joint_pos)
+
+
+def lowest_point(config: ObjectConfig, trajectory: ObjectTrajectory) -> np.ndarray:
+    """Height of the object's lowest point above the ground, m. [T]"""
+    poses, heights = object_poses(config, trajectory), []
+    for name, surface in object_surfaces(config).items():
+        pos, rotation = poses[name]
+        down = rotation.inv().apply([0.0, 0.0, -1.0])
+        heights += [pos[:, 2] - _extent(geom, down) for geom in surface.geoms]
+    return np.min(heights, axis=0)
+
+
+def _extent(geom: GeomConfig, direction: np.ndarray) -> np.ndarray:
+    """How far a geom reaches in unit directions of its body's frame, m. [T, 3] -> [T]"""
+    tilt = Rotation.from_quat(geom.body_quat, scalar_first=True)
+    local = (tilt * Rotation.from_quat(geom.quat, scalar_first=True)).inv().apply(direction)
+    offset = direction @ tilt.apply(geom.pos)
+    if geom.mesh is not None:
+        return offset + (local @ load_mesh(geom.mesh, geom.scale).convex_hull.vertices.T).max(axis=1)
+    if geom.box is not None:
+        return offset + np.abs(local) @ np.asarray(geom.box, float)
+    if geom.sphere is not None:
+        return offset + np.ravel(geom.sphere)[0]
+    if geom.capsule is not None:
+        return offset + np.abs(local[:, 2]) * geom.capsule[1] + geom.capsule[0]
+    size: Any = geom.cylinder
+    return offset + np.abs(local[:, 2]) * size[1] + np.linalg.norm(local[:, :2], axis=-1) * size[0]
+
+
+def on_object(
+    points: np.ndarray,
+    hand: Rotation,
+    config: ObjectConfig,
+    source: ObjectTrajectory,
+    scaled: ObjectTrajectory,
+    contact: np.ndarray | None,
+    fps: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where a palm is in the robot's scene if it keeps its place in the frame of the object's nearest body.
+
+    It stays so far outside of the surface that the robot's hand does, too, and where contact is labelled it comes as
+    near as that.
+
+    Args:
+        points: in the person's scene, m. [T, 3]
+        hand: orientation that the robot's hand should have. [T]
+        source, scaled: the object in the person's scene and in the robot's.
+        contact: bool [T] or None.
+
+    Returns:
+        The points in the robot's scene [T, 3], and how far they count, from 0 (far from the object) to 1. [T]
+    """
+    hold = np.zeros(len(points)) if contact is None else _held(contact, fps)
+    before, after = object_poses(config, source), object_poses(config, scaled)
+    gaps, moved = [], []
+    for name, surface in object_surfaces(config).items():
+        pos, rotation = before[name]
+        local = rotation.inv().apply(points - pos)
+        gap, nearest = surface.distance(local), surface.nearest(local)
+        normal = (local - nearest) * np.sign(gap)[:, None]
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+        inwards = hand.inv().apply(-rotation.apply(normal))
+        depth = _HAND_RADIUS + (inwards @ _HAND.T).max(axis=1)
+        wanted = np.maximum(gap, depth)
+        wanted += hold * (depth - wanted)
+        pos, rotation = after[name]
+        gaps.append(gap)
+        moved.append(pos + rotation.apply(nearest + wanted[:, None] * normal))
+    closest = np.argmin(gaps, axis=0)
+    gap = np.min(gaps, axis=0)
+    share = np.clip((_FAR - gap) / (_FAR - _NEAR), 0.0, 1.0)
+    share = share**2 * (3 - 2 * share)
+    return np.array(moved)[closest, np.arange(len(points))], np.maximum(share, hold)
+
+
+def _held(contact: np.ndarray, fps: float) -> np.ndarray:
+    """Contact labels with soft edges outside of them. [T] in 0..1"""
+    soft = gaussian_filter1d(contact.astype(float), _RAMP * fps / 2, mode="nearest")
+    return np.where(contact, 1.0, np.minimum(2 * soft, 1.0))
