@@ -26,7 +26,7 @@ install: $(STAMP) ## create .venv and install the package with its tools
 $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -c constraints.txt '$(TORCH)'
-	$(BIN)/python -m pip install -c constraints.txt -e '.[dev,retarget,ray,cluster]'
+	$(BIN)/python -m pip install -c constraints.txt -e '.[dev,retarget,gpu,ray,cluster]'
 	touch $@
 
 format: $(STAMP) ## format the code and fix what ruff can fix
@@ -39,7 +39,7 @@ lint: $(STAMP) ## check style, formatting and types
 	$(BIN)/mypy
 
 test: $(STAMP) ## run the tests; HDMI_MOTIONS=FOLDER adds those on the public motions
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 train: $(STAMP) ## train with the default configuration; ARGS='key=value ...' overrides it
 	$(BIN)/python train.py $(ARGS)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import mujoco
 import torch
 from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
@@ -14,7 +15,7 @@ from rich.table import Table
 from torchrl.envs import CatTensors, Compose, RemoveEmptySpecs, SelectTransform, Transform
 
 from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene
-from hdmi.envs import BatchBackend, HumanoidObjectEnv, RowResetEnv
+from hdmi.envs import BatchBackend, HumanoidObjectEnv, MaskedResetEnv, PhysicsBackend, RowResetEnv
 from hdmi.motion import Reference, find_motion, make_reference
 
 # What leaves the stack besides the state that steps read back.
@@ -90,7 +91,7 @@ def _container(node: Any) -> dict[str, Any]:
 
 
 def _dataclass(cls: type, node: Any, where: str) -> Any:
-    values = _container(node)
+    values = _container(node) if OmegaConf.is_config(node) else node
     names = {f.name for f in fields(cls)}
     if unknown := set(values) - names:
         raise ConfigError(f"{where}: unknown {sorted(map(str, unknown))}; there is {sorted(names)}")
@@ -120,7 +121,7 @@ def make_task(cfg: DictConfig) -> Task:
     """
     parts = scene_parts(cfg)
     robot = parts.pop("robot")
-    sim = _dataclass(SimConfig, cfg.sim, "sim")
+    sim = _dataclass(SimConfig, {k: v for k, v in cfg.sim.items() if k not in ("device", "backend")}, "sim")
     task = cfg.task
     reference = make_reference(find_motion(task.motion, cfg.motion_root), control_dt=sim.control_dt, **parts)
     try:
@@ -130,27 +131,37 @@ def make_task(cfg: DictConfig) -> Task:
     return Task(task.name, scene, reference)
 
 
+def backend_of(cfg: DictConfig) -> Callable[[mujoco.MjModel, int], PhysicsBackend]:
+    """What makes the physics backend of a config's sim node from a model and a number of worlds."""
+    node = cfg.sim.get("backend") or {"_target_": f"{BatchBackend.__module__}.{BatchBackend.__qualname__}"}
+
+    def make(model: mujoco.MjModel, num_worlds: int) -> PhysicsBackend:
+        given = {"device": cfg.sim.get("device"), "num_threads": cfg.num_threads}
+        backend: PhysicsBackend = build(node, "sim.backend", model=model, num_worlds=num_worlds, **given)
+        return backend
+
+    return make
+
+
 def make_env(
     cfg: DictConfig,
     num_envs: int | None = None,
     task: Task | None = None,
     pixels: tuple[int, int] | None = None,
-    backend: Callable[..., Any] | None = None,
+    backend: Callable[[mujoco.MjModel, int], PhysicsBackend] | None = None,
 ) -> RowResetEnv:
     """The environment of a config: the base environment under the transforms that `cfg.stack` lists.
 
     Args:
         num_envs: instead of the config's.
         task: made from the config if absent.
+        backend: instead of the config's.
     """
     task = make_task(cfg) if task is None else task
-    threads = cfg.num_threads
-
-    def default_backend(model: Any, count: int) -> BatchBackend:
-        return BatchBackend(model, count, threads)
-
-    base = HumanoidObjectEnv(task.scene, num_envs or cfg.num_envs, backend or default_backend, pixels)
-    env = RowResetEnv(base, Compose(*(transform for _, transform in make_transforms(cfg, task))))
+    base = HumanoidObjectEnv(task.scene, num_envs or cfg.num_envs, backend or backend_of(cfg), pixels)
+    here = replace(task, reference=task.reference.to(base.device))
+    stack = Compose(*(transform for _, transform in make_transforms(cfg, here))).to(base.device)
+    env = (MaskedResetEnv if base.backend.masked else RowResetEnv)(base, stack)
     # raw keys are dropped, but for what steps read back and what learners and logs want
     state = set(env.full_state_spec.keys(True, True))
     entries = list(env.full_observation_spec.keys(True, True))

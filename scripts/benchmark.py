@@ -3,13 +3,15 @@
 `python scripts/benchmark.py [any option of train.py]`. Nothing else should run on the machine. Figures are control
 steps per second; blocks of the measurements alternate and medians are reported, so that the ratios hold even where the
 machine's speed drifts. Beside them stand other environments on the CPU (see conf/benchmark.yaml). The last line of
-the output is one JSON object.
+the output is one JSON object. `sim=gpu` measures MuJoCo Warp; scripts/gpu_report.py tabulates engines by number of
+worlds.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import resource
 import statistics
 import sys
 import tempfile
@@ -21,57 +23,91 @@ from typing import Any
 
 import hydra
 import mujoco
-import numpy as np
 import torch
 from mujoco.batch import Batch
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
 from hdmi.assets import Scene
-from hdmi.build import Task, make_env, make_transforms
+from hdmi.build import Task, backend_of, make_env, make_transforms
+from hdmi.envs import BatchBackend
 from hdmi.evaluation.comparison import mjlab_speed, mujoco_env_speed
 from hdmi.learning import Trainer
 
 _BLOCKS, _STEPS, _ITERATIONS = 7, 20, 4
 
 
+def now() -> float:
+    """s, once a GPU has done what it was asked."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def peak_memory(device: torch.device) -> dict[str, float]:
+    """GB of this process so far, and of the GPU."""
+    peak = {"memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9}
+    if device.type == "cuda":
+        free, total = torch.cuda.mem_get_info(device)
+        peak["gpu_memory_gb"] = (total - free) / 1e9  # torch's and Warp's pools give nothing back
+    return peak
+
+
+class HeldBatch:
+    """MuJoCo's Batch as it is, each control held for the whole control step."""
+
+    def __init__(self, model: mujoco.MjModel, num_worlds: int, num_threads: int):
+        self.batch = Batch(model, num_worlds, num_threads, persistent=True)
+
+    def data(self, field: str) -> Tensor:
+        return torch.from_numpy(self.batch.bind(field))
+
+    def refresh(self, worlds: Tensor) -> None:
+        self.batch.forward(worlds.numpy())
+
+    def step(self, controls: Tensor) -> None:
+        self.data("ctrl").copy_(controls[:, 0])
+        self.batch.step(nstep=controls.shape[1], stage=mujoco.mjtStage.mjSTAGE_VEL)
+
+
 class RawPhysics:
-    """MuJoCo's Batch alone on the model of an environment, through what that environment has just gone through.
+    """The engine alone on the model of an environment, through what that environment has just gone through.
 
     It starts from the same states and is given the same joint targets, once per control step; nothing is reset, read
     or delayed. With targets that do not change, robots come to rest and physics gets cheaper than in training.
     """
 
-    def __init__(self, env: TransformedEnv, num_threads: int):
+    def __init__(self, env: TransformedEnv, cfg: DictConfig):
         self.base = env.base_env
-        self.batch = Batch(self.base.scene.model, self.base.num_envs, num_threads, persistent=True)
-        self.start: dict[str, np.ndarray] = {}
-        self.targets: list[np.ndarray] = []
+        model, n = self.base.scene.model, self.base.num_envs
+        on_cpu = isinstance(self.base.backend, BatchBackend)
+        self.engine = HeldBatch(model, n, cfg.num_threads) if on_cpu else backend_of(cfg)(model, n)
+        self.start: dict[str, Tensor] = {}
+        self.targets: list[Tensor] = []
 
     def begin(self) -> None:
         """Remembers the states from which to start."""
         fields = ("qpos", "qvel", "ctrl", "qacc_warmstart")
-        self.start = {field: self.base.backend.data(field).numpy().copy() for field in fields}
+        self.start = {field: self.base.backend.data(field).clone() for field in fields}
         self.targets = []
 
     def record(self) -> None:
         """Remembers the targets of the environment's last step."""
-        self.targets.append(self.base.backend.data("ctrl").numpy().copy())
+        self.targets.append(self.base.backend.data("ctrl").clone())
 
     def replay(self) -> float:
         """Control steps of all worlds per second."""
         for field, values in self.start.items():
-            self.batch.bind(field)[:] = values
-        self.batch.forward()
-        ctrl = self.batch.bind("ctrl")
-        start = time.perf_counter()
+            self.engine.data(field).copy_(values)
+        self.engine.refresh(torch.arange(self.base.num_envs, device=self.base.device))
+        start = now()
         for targets in self.targets:
-            ctrl[:] = targets
-            self.batch.step(nstep=self.base.scene.sim.decimation, stage=mujoco.mjtStage.mjSTAGE_VEL)
-        return self.base.num_envs * len(self.targets) / (time.perf_counter() - start)
+            self.engine.step(targets.unsqueeze(1).expand(-1, self.base.scene.sim.decimation, -1))
+        return self.base.num_envs * len(self.targets) / (now() - start)
 
 
 def step_env(
@@ -84,9 +120,9 @@ def step_env(
     for _ in range(count):
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             carry = policy(carry)
-        start = time.perf_counter()
+        start = now()
         _, carry = env.step_and_maybe_reset(carry)
-        spent += time.perf_counter() - start
+        spent += now() - start
         if raw is not None:
             raw.record()
     return env.base_env.num_envs * count / spent, carry
@@ -103,9 +139,9 @@ def transform_times(cfg: DictConfig, task: Task, policy: Any, count: int) -> dic
 
     def timed(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
-            start = time.perf_counter()
+            start = now()
             result = method(*args, **kwargs)
-            spent[name] += time.perf_counter() - start
+            spent[name] += now() - start
             return result
 
         return call
@@ -157,7 +193,7 @@ def main(cfg: DictConfig) -> None:
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(cfg, Path(folder))
         env, policy = trainer.env, trainer.actor
-        raw = RawPhysics(env, cfg.num_threads)
+        raw = RawPhysics(env, cfg)
         with torch.no_grad():
             carry = env.reset()
         _, carry = step_env(env, carry, policy, _STEPS, raw)
@@ -171,11 +207,11 @@ def main(cfg: DictConfig) -> None:
 
         collect, learn, train, raw_beside = [], [], [], []
         for i in range(_ITERATIONS + 1):
-            start = time.perf_counter()
+            start = now()
             batch = trainer.collector.next()
-            middle = time.perf_counter()
+            middle = now()
             trainer.update(batch)
-            end = time.perf_counter()
+            end = now()
             if i:  # the first one warms up
                 frames = trainer.frames_per_batch
                 collect.append(frames / (middle - start))
@@ -196,6 +232,8 @@ def main(cfg: DictConfig) -> None:
         "train_ratio": median(t / r for t, r in zip(train, raw_beside, strict=True)),
         "num_envs": cfg.num_envs,
         "task": cfg.task.name,
+        "engine": f"{type(env.base_env.backend).__name__} on {env.base_env.device}",
+        **peak_memory(env.base_env.device),
         **others,
     }
     table = Table(title="Time per control step by transform, not compiled, resets included", title_justify="left")

@@ -1,6 +1,6 @@
 """Evaluates a checkpoint by the paper's protocol; prints the figures and writes eval.json.
 
-    python scripts/evaluate.py checkpoint=RUN [num_envs=256] [terminations=all] [seed=0] [task=NAME] ...
+    python scripts/evaluate.py checkpoint=RUN [num_envs=256] [terminations=all] [seed=0] [task=NAME] [sim=cpu|gpu] ...
     python scripts/evaluate.py agent=zero|random [task=lift_box] ...
 
 `checkpoint` is a run folder (its newest checkpoint counts) or a checkpoint file. `terminations` are those that end
@@ -20,7 +20,7 @@ from rich.console import Console
 from hdmi.build import ConfigError
 from hdmi.cli import USER_ERRORS
 from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy
-from hdmi.evaluation.agents import AGENTS, BlindAgent, task_config
+from hdmi.evaluation.agents import AGENTS, BlindAgent, choose_engine, task_config
 from hdmi.evaluation.options import parse_options, parse_terminations
 
 
@@ -36,6 +36,7 @@ class Options:
     task: str | None = None  # for an agent: lift_box; for a checkpoint: that it must be of
     motion_root: str | None = None  # instead of the training's
     num_threads: int | None = None  # of physics, instead of the training's
+    sim: str | None = None  # engine, cpu or gpu; for a checkpoint: instead of the training's
     out: str | None = None  # instead of eval.json in the run folder
 
 
@@ -45,6 +46,8 @@ def evaluate_agent(options: Options, terminations: list[str] | None) -> EvalResu
     cfg = task_config(options.task or "lift_box", options.motion_root)
     if options.num_threads is not None:
         cfg.num_threads = options.num_threads
+    if options.sim is not None:
+        choose_engine(cfg, options.sim)
     agent = BlindAgent(options.agent, cfg.action.history.size)
     result = evaluate_policy(agent, cfg, options.num_envs, terminations=terminations, seed=options.seed)
     if options.out is not None:
@@ -77,6 +80,7 @@ def main(arguments: list[str]) -> int:
                 options.task,
                 options.motion_root,
                 options.num_threads,
+                options.sim,
             )
     except (*USER_ERRORS, OSError) as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)

@@ -92,3 +92,15 @@ def test_adaptive_starts_count_the_terminations_of_the_whole_stack() -> None:
     env.rollout(3, break_when_any_done=False)
     adaptive = next(t for t in env.transform.transforms if isinstance(t, AdaptiveStateInitialization))
     assert 5.9 < float(adaptive.failures.sum()) <= 6.0
+
+
+def test_gpu_report_keeps_what_could_not_be_measured(tmp_path: Path) -> None:
+    options = ["engines=[cpu,tpu]", "worlds=[2]", f"out={tmp_path / 'report.jsonl'}"]
+    tiny = "overrides=[algo.frames_per_env=4,algo.bf16=false,num_threads=1,logger=csv,nonsense]"
+    command = [sys.executable, str(ROOT / "scripts" / "gpu_report.py"), *options, tiny]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=200)
+    assert result.returncode == 0, result.stderr
+    rows = [json.loads(line) for line in (tmp_path / "report.jsonl").read_text().splitlines()]
+    assert [(row["sim"], row["num_envs"]) for row in rows] == [("cpu", 2), ("tpu", 2)]
+    assert all(row["error"] for row in rows)
+    assert "env steps/s" in result.stdout

@@ -17,10 +17,19 @@ MAX_VELOCITY = 1e3  # m/s or rad/s; beyond it a world counts as diverged
 
 
 class PhysicsBackend(Protocol):
-    """What the environment needs of an engine. Tensors are live: copy before keeping them."""
+    """What the environment needs of an engine. Tensors are live: copy before keeping them.
+
+    Methods that concern some worlds take `worlds`: their numbers, int64 [n], or a mask, bool [N].
+
+    Attributes:
+        num_worlds: N.
+        device: of all tensors.
+        masked: whether worlds are better chosen by masks: a host that asks for numbers would wait for the device.
+    """
 
     num_worlds: int
     device: torch.device
+    masked: bool
 
     def data(self, field: str) -> Tensor:
         """A field of MjData for all worlds. [N, ...]"""
@@ -35,19 +44,23 @@ class PhysicsBackend(Protocol):
         ...
 
     def reset(self, worlds: Tensor) -> None:
-        """Puts worlds into the model's default state; follow with `refresh`. int64 [n]"""
+        """Puts worlds into the model's default state; follow with `refresh`."""
         ...
 
     def refresh(self, worlds: Tensor) -> None:
-        """Recomputes what derives from the state of the given worlds. int64 [n]"""
+        """Recomputes what derives from the state of the given worlds."""
         ...
 
     def commit_model(self, worlds: Tensor) -> None:
-        """Recomputes the constants that derive from model fields of the given worlds. int64 [n]"""
+        """Recomputes the constants that derive from model fields of the given worlds; follow with `refresh`."""
         ...
 
     def failed(self) -> Tensor:
         """Worlds whose state is not finite or absurdly fast. bool [N]"""
+        ...
+
+    def overflows(self) -> int:
+        """Steps of single worlds, so far, whose contacts or constraints did not all fit; warns what to raise."""
         ...
 
     def get_state(self) -> dict[str, Tensor]:
@@ -63,7 +76,73 @@ class PhysicsBackend(Protocol):
         ...
 
 
-class BatchBackend:
+def assign(live: Tensor, worlds: Tensor, rows: Tensor) -> None:
+    """Writes rows of some worlds into a live tensor [N, ...], in its dtype.
+
+    Args:
+        worlds: numbers, int64 [n], of n rows; or a mask, bool [N], of N rows, of which those in the mask are written.
+    """
+    if worlds.dtype == torch.bool:
+        mask = worlds.reshape(-1, *[1] * (live.ndim - 1))
+        live.copy_(torch.where(mask, rows.to(live.dtype), live))
+    else:
+        live[worlds] = rows.to(live.dtype)
+
+
+class LiveBackend:
+    """What backends share: cached live tensors, failures, and saving the state."""
+
+    num_worlds: int
+    device: torch.device
+
+    def __init__(self) -> None:
+        self._data: dict[str, Tensor] = {}
+        self._model: dict[str, Tensor] = {}
+
+    def _bind(self, field: str) -> Tensor:
+        """The live tensor of a field of MjData."""
+        raise NotImplementedError
+
+    def _expand(self, field: str) -> Tensor:
+        """The live tensor of a field of MjModel that is to differ between worlds."""
+        raise NotImplementedError
+
+    def data(self, field: str) -> Tensor:
+        if field not in self._data:
+            self._data[field] = self._bind(field)
+        return self._data[field]
+
+    def model(self, field: str) -> Tensor:
+        if field not in self._model:
+            self._model[field] = self._expand(field)
+        return self._model[field]
+
+    def failed(self) -> Tensor:
+        qvel = self.data("qvel")
+        # a NaN fails the comparison
+        return ~((qvel.abs().amax(-1) < MAX_VELOCITY) & self.data("qpos").sum(-1).isfinite())
+
+    def get_state(self) -> dict[str, Tensor]:
+        state = {f"data/{field}": self.data(field).clone() for field in STATE_FIELDS}
+        return state | {f"model/{field}": value.clone() for field, value in self._model.items()}
+
+    def set_state(self, state: dict[str, Tensor]) -> None:
+        everyone = torch.arange(self.num_worlds, device=self.device)
+        for key, value in state.items():
+            kind, field = key.split("/")
+            (self.data(field) if kind == "data" else self.model(field)).copy_(value)
+        self.commit_model(everyone)
+        self.refresh(everyone)
+        self.data("qacc_warmstart").copy_(state["data/qacc_warmstart"])
+
+    def commit_model(self, worlds: Tensor) -> None:
+        raise NotImplementedError
+
+    def refresh(self, worlds: Tensor) -> None:
+        raise NotImplementedError
+
+
+class BatchBackend(LiveBackend):
     """MuJoCo's `Batch`: worlds stepped by a pool of C threads on the CPU.
 
     Controls that change within a control step cost nothing: they are laid out in MuJoCo's history of each actuator,
@@ -73,7 +152,10 @@ class BatchBackend:
         num_threads: 0 for all processors.
     """
 
+    masked = False
+
     def __init__(self, model: mujoco.MjModel, num_worlds: int, num_threads: int = 0):
+        super().__init__()
         slots = set(model.actuator_history[:, 0].tolist())
         if len(slots) != 1 or 0 in slots:
             raise ValueError(
@@ -88,21 +170,15 @@ class BatchBackend:
         self._batch = Batch(model, num_worlds, num_threads, persistent=True)
         self.num_worlds = num_worlds
         self.device = torch.device("cpu")
-        self._data: dict[str, Tensor] = {}
-        self._model: dict[str, Tensor] = {}
 
-    def data(self, field: str) -> Tensor:
-        if field not in self._data:
-            with warnings.catch_warnings():
-                # outputs are read-only arrays, which torch cannot express; nobody writes to them
-                warnings.filterwarnings("ignore", message=".*not writable.*")
-                self._data[field] = torch.from_numpy(self._batch.bind(field))
-        return self._data[field]
+    def _bind(self, field: str) -> Tensor:
+        with warnings.catch_warnings():
+            # outputs are read-only arrays, which torch cannot express; nobody writes to them
+            warnings.filterwarnings("ignore", message=".*not writable.*")
+            return torch.from_numpy(self._batch.bind(field))
 
-    def model(self, field: str) -> Tensor:
-        if field not in self._model:
-            self._model[field] = torch.from_numpy(self._batch.expand(field))
-        return self._model[field]
+    def _expand(self, field: str) -> Tensor:
+        return torch.from_numpy(self._batch.expand(field))
 
     def step(self, controls: Tensor) -> None:
         num_steps = controls.shape[1]
@@ -126,32 +202,20 @@ class BatchBackend:
         self.data("history")[worlds] = history.flatten(1)
 
     def reset(self, worlds: Tensor) -> None:
-        self._batch.reset(worlds.numpy(), stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self._batch.reset(_numbers(worlds).numpy(), stage=mujoco.mjtStage.mjSTAGE_NONE)
 
     def refresh(self, worlds: Tensor) -> None:
+        worlds = _numbers(worlds)
+        if not len(worlds):
+            return
         self._schedule(worlds, self.data("ctrl")[worlds].unsqueeze(1))
         self._batch.forward(worlds.numpy())
 
     def commit_model(self, worlds: Tensor) -> None:
-        self._batch.set_const(worlds.numpy())
+        self._batch.set_const(_numbers(worlds).numpy())
 
-    def failed(self) -> Tensor:
-        qvel = self.data("qvel")
-        # a NaN fails the comparison
-        return ~((qvel.abs().amax(-1) < MAX_VELOCITY) & self.data("qpos").sum(-1).isfinite())
-
-    def get_state(self) -> dict[str, Tensor]:
-        state = {f"data/{field}": self.data(field).clone() for field in STATE_FIELDS}
-        return state | {f"model/{field}": value.clone() for field, value in self._model.items()}
-
-    def set_state(self, state: dict[str, Tensor]) -> None:
-        everyone = torch.arange(self.num_worlds)
-        for key, value in state.items():
-            kind, field = key.split("/")
-            (self.data(field) if kind == "data" else self.model(field)).copy_(value)
-        self.commit_model(everyone)
-        self.refresh(everyone)
-        self.data("qacc_warmstart").copy_(state["data/qacc_warmstart"])
+    def overflows(self) -> int:
+        return 0  # they share an arena that MuJoCo sizes for the model
 
     def world(self, index: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         model = self._batch.get_model(index)
@@ -159,3 +223,7 @@ class BatchBackend:
         model.actuator_delay[:] = 0.0  # the schedule is over: forces are those of `ctrl`
         mujoco.mj_forward(model, data)
         return model, data
+
+
+def _numbers(worlds: Tensor) -> Tensor:
+    return worlds.nonzero().squeeze(-1) if worlds.dtype == torch.bool else worlds

@@ -13,7 +13,7 @@ from torchrl.data import Binary, Composite, Unbounded, UnboundedDiscrete
 from torchrl.envs import EnvBase
 
 from hdmi.assets import Scene, g1
-from hdmi.envs.backend import BatchBackend, PhysicsBackend
+from hdmi.envs.backend import BatchBackend, PhysicsBackend, assign
 from hdmi.envs.rendering import WorldRenderer
 from hdmi.functional import body_velocity, quat_apply_inverse
 
@@ -25,7 +25,8 @@ class HumanoidObjectEnv(EnvBase):
     """N worlds of one scene as a batch-locked TorchRL environment of raw state.
 
     There is no reward and no task here: transforms add them. `terminated` is set only for a world whose physics
-    diverged; that world is put back into the default state at once and counted in `num_diverged`.
+    diverged; it is counted in `num_diverged` and shows the default state. A backend that takes masks leaves it as it
+    is until it is reset (and counts it in every step until then); others put it back into the default state at once.
 
     Action:
         `action`: joint position targets, rad. [N, 29], held for the control step; or [N, S, 29], one after
@@ -66,22 +67,50 @@ class HumanoidObjectEnv(EnvBase):
         self.backend = backend(scene.model, num_envs)
         super().__init__(device=self.backend.device, batch_size=[num_envs])
         self.scene = scene
-        self.num_diverged = 0
         self._pixels = pixels
         self._renderer: WorldRenderer | None = None
-        model = scene.model
-        self._object_scale = torch.ones(num_envs, 1)
-        self._geom_base = {f: torch.from_numpy(getattr(model, f).copy()) for f in ("geom_size", "geom_pos")}
-        self._default_qpos = torch.from_numpy(scene.default_qpos)
         self._joint_qpos = _slice(scene.joint_qpos)
         self._joint_dof = _slice(scene.joint_dof)
         self._body = _slice(scene.body_ids)
+        self._standing: dict[str, Tensor | None] = {}  # rows that all worlds have
+        self._make_constants()
         self._make_specs()
+        self._fallback = self._default_state() if self.backend.masked else None
 
     @property
     def num_envs(self) -> int:
         """Number of worlds."""
         return self.batch_size[0]
+
+    @property
+    def num_diverged(self) -> int:
+        """Worlds that have diverged so far. Reading it waits for the device."""
+        return int(self._diverged)
+
+    @num_diverged.setter
+    def num_diverged(self, count: int) -> None:
+        self._diverged.fill_(count)
+
+    def _make_constants(self) -> None:
+        """Tensors on the backend's device: what is made in a step from the host's memory would stop it."""
+        scene, model = self.scene, self.scene.model
+
+        def constant(values: object) -> Tensor:
+            return torch.as_tensor(np.array(values), device=self.device)
+
+        self._diverged = torch.zeros((), dtype=torch.int64, device=self.device)
+        self._everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        self._object_scale = torch.ones(self.num_envs, 1, device=self.device)
+        self._default_qpos = constant(scene.default_qpos).to(self.backend.data("qpos").dtype)
+        self._body_root = constant(model.body_rootid).long()
+        # the servo's derivative gain is the joint's damping
+        self._servo_damping = constant(model.dof_damping[scene.joint_dof]).float()
+        self._foot_sensors = constant(scene.foot_sensors)
+        self._effector_sensors = constant(scene.effector_sensors)
+        self._object_geoms = _slice(scene.object_geoms) if len(scene.object_geoms) else slice(0)
+        self._geom_base = {f: constant(getattr(model, f)[self._object_geoms]) for f in ("geom_size", "geom_pos")}
+        bodies = sorted({i for i in (scene.object_body, scene.object_link) if i is not None})
+        self._object_bodies = constant(np.array(bodies, dtype=np.int64))
 
     # -- specs ------------------------------------------------------------------------------------------------
 
@@ -134,10 +163,7 @@ class HumanoidObjectEnv(EnvBase):
             self._push(push)
         self.backend.step(targets.repeat_interleave(decimation // count, dim=1))
         failed = self.backend.failed()
-        if failed.any():
-            self.num_diverged += int(failed.sum())
-            self._reset_worlds(failed.nonzero().squeeze(-1), None)
-        out = self._state(slice(None))
+        out = self._survivors(failed)
         terminated = failed.unsqueeze(-1)
         out.set("diverged", terminated)
         out.set("reward", torch.zeros(self.num_envs, 1, device=self.device))
@@ -146,21 +172,29 @@ class HumanoidObjectEnv(EnvBase):
         out.set("done", terminated.clone())
         return out
 
+    def _survivors(self, failed: Tensor) -> TensorDict:
+        """The state of all worlds, of those that failed the default one. bool [N]"""
+        if self._fallback is not None:
+            # whether any has failed is not known on the host, and a reset of none costs as much as one of all
+            self._diverged += failed.sum()
+            return self._fallback.where(failed, self._state(slice(None)))
+        if failed.any():
+            self._diverged += failed.sum()
+            self._reset_worlds(failed.nonzero().squeeze(-1), None)
+        return self._state(slice(None))
+
     def _push(self, velocity: Tensor) -> None:
         """Adds linear and angular world velocities to the root. [N, 6]"""
-        worlds = (velocity != 0).any(-1).nonzero().squeeze(-1)
-        if not len(worlds):
-            return
-        qvel, quat = self.backend.data("qvel"), self.backend.data("qpos")[worlds, 3:7]
-        qvel[worlds, :3] += velocity[worlds, :3].double()
-        qvel[worlds, 3:6] += quat_apply_inverse(quat, velocity[worlds, 3:].double())
-        self.backend.refresh(worlds)
+        qvel, quat = self.backend.data("qvel"), self.backend.data("qpos")[:, 3:7]
+        velocity = velocity.to(qvel.dtype)
+        qvel[:, :3] += velocity[:, :3]
+        qvel[:, 3:6] += quat_apply_inverse(quat, velocity[:, 3:])
+        self.backend.refresh((velocity != 0).any(-1))
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        worlds = torch.arange(self.num_envs) if mask is None else mask.reshape(-1).nonzero().squeeze(-1)
         init = None if tensordict is None else tensordict.get("init", None)
-        self._reset_worlds(worlds, None if init is None else init[worlds])
+        self._reset_worlds(self._everyone if mask is None else mask.reshape(-1), init)
         return self._fresh(slice(None), self.batch_size)
 
     def reset_rows(self, tensordict: TensorDictBase) -> TensorDict:
@@ -193,19 +227,24 @@ class HumanoidObjectEnv(EnvBase):
 
     def set_state(self, state: TensorDictBase) -> None:
         """Restores what `get_state` returned."""
+        self._standing.clear()
         self._object_scale.copy_(state["object_scale"])
         self.backend.set_state(dict(state["backend"].items()))
 
     # -- reset ------------------------------------------------------------------------------------------------
 
     def _reset_worlds(self, worlds: Tensor, init: TensorDictBase | None) -> None:
-        """Puts worlds into the model's default state, overwritten by what `init` gives. int64 [n], batch [n]"""
+        """Puts worlds into the model's default state, overwritten by what `init` gives.
+
+        Args:
+            worlds: numbers, int64 [n], with an `init` of batch [n]; or a mask, bool [N], with an `init` of batch [N].
+        """
         backend, scene = self.backend, self.scene
         init = TensorDict({}, batch_size=worlds.shape) if init is None else init
         self._write_model(worlds, init)
         backend.reset(worlds)
         qpos = self._default_qpos.expand(len(worlds), -1).clone()
-        qvel = torch.zeros(len(worlds), scene.model.nv, dtype=qpos.dtype)
+        qvel = qpos.new_zeros(len(worlds), scene.model.nv)
 
         def write(target: Tensor, where: slice | int | None, key: str) -> None:
             value = init.get(key, None)
@@ -230,27 +269,33 @@ class HumanoidObjectEnv(EnvBase):
             write(qpos, slice(q, q + 1), "object_joint_pos")
             write(qvel, slice(v, v + 1), "object_joint_vel")
 
-        backend.data("qpos")[worlds] = qpos
-        backend.data("qvel")[worlds] = qvel
-        backend.data("ctrl")[worlds] = qpos[:, self._joint_qpos]
+        assign(backend.data("qpos"), worlds, qpos)
+        assign(backend.data("qvel"), worlds, qvel)
+        assign(backend.data("ctrl"), worlds, qpos[:, self._joint_qpos])
         backend.refresh(worlds)
 
     def _write_model(self, worlds: Tensor, init: TensorDictBase) -> None:
         commit = False
         fields = init.get("model", None)
         for field, value in () if fields is None else fields.items():
-            self.backend.model(field)[worlds] = value.double()
-            commit |= field in _SET_CONST_FIELDS
+            if self._changes(field, worlds, value):
+                assign(self.backend.model(field), worlds, value)
+                commit |= field in _SET_CONST_FIELDS
         scale = init.get("object_scale", None)
-        if scale is not None:
-            self._object_scale[worlds] = scale
-            geoms = torch.from_numpy(self.scene.object_geoms)
+        if scale is not None and self._changes("object_scale", worlds, scale):
+            assign(self._object_scale, worlds, scale)
             for field, base in self._geom_base.items():
-                rows = self.backend.model(field)
-                rows[worlds.unsqueeze(-1), geoms] = base[geoms] * scale.double().unsqueeze(-1)
+                assign(self.backend.model(field)[:, self._object_geoms], worlds, scale.unsqueeze(-1) * base)
             commit = True
         if commit:
             self.backend.commit_model(worlds)
+
+    def _changes(self, name: str, worlds: Tensor, rows: Tensor) -> bool:
+        """Whether not all worlds have been given these very rows before, as by what is drawn once per world."""
+        if self._standing.get(name) is rows:
+            return False
+        self._standing[name] = rows if worlds is self._everyone else None
+        return True
 
     # -- reading ----------------------------------------------------------------------------------------------
 
@@ -259,27 +304,23 @@ class HumanoidObjectEnv(EnvBase):
         scene = self.scene
 
         def read(field: str) -> Tensor:
-            return self.backend.data(field)[rows].to(torch.float32)
+            return self.backend.data(field)[rows].to(torch.float32, copy=True)
 
         xpos, xquat = read("xpos"), read("xquat")  # [N, nbody, *]
-        lin_vel, ang_vel = body_velocity(
-            read("cvel"), xpos, read("subtree_com")[:, torch.from_numpy(scene.model.body_rootid)]
-        )
+        lin_vel, ang_vel = body_velocity(read("cvel"), xpos, read("subtree_com")[:, self._body_root])
         qpos, qvel, sensors = read("qpos"), read("qvel"), read("sensordata")
         joint_vel = qvel[:, self._joint_dof]
-        damping = torch.from_numpy(scene.model.dof_damping[scene.joint_dof]).float()
         robot = {
             "joint_pos": qpos[:, self._joint_qpos],
             "joint_vel": joint_vel,
-            # the servo's derivative gain is the joint's damping
-            "joint_torque": read("actuator_force") - damping * joint_vel,
+            "joint_torque": read("actuator_force") - self._servo_damping * joint_vel,
             "joint_target": read("ctrl"),
             "body_pos": xpos[:, self._body],
             "body_quat": xquat[:, self._body],
             "body_lin_vel": lin_vel[:, self._body],
             "body_ang_vel": ang_vel[:, self._body],
             # the sensors report what the robot exerts; what it feels is the opposite
-            "foot_force": -sensors[:, torch.from_numpy(scene.foot_sensors)],
+            "foot_force": -sensors[:, self._foot_sensors],
         }
         robot |= {f"root_{key}": robot[f"body_{key}"][:, 0] for key in ("pos", "quat", "lin_vel", "ang_vel")}
         n = len(qpos)
@@ -288,6 +329,8 @@ class HumanoidObjectEnv(EnvBase):
         if scene.object_body is not None:
             body, link = scene.object_body, scene.object_link
             hinge_q, hinge_v = scene.object_hinge_qpos, scene.object_hinge_dof
+            mass = self.backend.model("body_mass")[:, self._object_bodies].sum(-1, keepdim=True)
+            friction = self.backend.model("geom_friction")[:, int(scene.object_geoms[-1]), :1]
             object_ = {
                 "pos": xpos[:, body],
                 "quat": xquat[:, body],
@@ -295,25 +338,26 @@ class HumanoidObjectEnv(EnvBase):
                 "ang_vel": ang_vel[:, body],
                 "link_pos": xpos[:, link],
                 "link_quat": xquat[:, link],
-                "joint_pos": torch.zeros(n, 0) if hinge_q is None else qpos[:, hinge_q : hinge_q + 1],
-                "joint_vel": torch.zeros(n, 0) if hinge_v is None else qvel[:, hinge_v : hinge_v + 1],
+                "joint_pos": qpos.new_zeros(n, 0) if hinge_q is None else qpos[:, hinge_q : hinge_q + 1],
+                "joint_vel": qpos.new_zeros(n, 0) if hinge_v is None else qvel[:, hinge_v : hinge_v + 1],
                 "scale": self._object_scale[rows].clone(),
-                "mass": self._object_model("body_mass", [body, link])[rows],
-                "friction": self._object_model("geom_friction", [int(scene.object_geoms[-1])])[rows],
+                "mass": mass[rows].to(torch.float32),
+                "friction": friction[rows].to(torch.float32, copy=True),
             }
-            force = -sensors[:, torch.from_numpy(scene.effector_sensors)]
+            force = -sensors[:, self._effector_sensors]
             state["object"] = TensorDict(object_, batch_size=bs, device=self.device)
             state["contact"] = TensorDict({"force": force}, batch_size=bs, device=self.device)
         out = TensorDict(state, batch_size=bs, device=self.device)
         if self._pixels is not None:
-            worlds = torch.arange(self.num_envs)[rows].tolist()
+            worlds = torch.arange(self.num_envs, device=self.device)[rows].tolist()
             frames = np.stack([self.render(i, *self._pixels) for i in worlds])
-            out.set("pixels", torch.from_numpy(frames))
+            out.set("pixels", torch.from_numpy(frames).to(self.device))
         return out
 
-    def _object_model(self, field: str, ids: list[int | None]) -> Tensor:
-        rows = self.backend.model(field)[:, sorted({i for i in ids if i is not None})].to(torch.float32)  # [N, i, ...]
-        return rows.sum(-1, keepdim=True) if rows.ndim == 2 else rows[:, -1, :1]
+    def _default_state(self) -> TensorDict:
+        """What any world shows in the default state. Batch [N], one row's memory."""
+        self._reset_worlds(self._everyone, None)
+        return self._state(torch.zeros(1, dtype=torch.int64, device=self.device)).expand(self.batch_size)
 
     def render(self, index: int = 0, height: int = 480, width: int = 640) -> np.ndarray:
         """A picture of one world from a camera that follows the robot. uint8 [height, width, 3]

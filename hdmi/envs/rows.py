@@ -91,3 +91,34 @@ class RowResetEnv(TransformedEnv):
                 # out of place: the collector keeps references to the last step's tensors
                 tensordict.set(key, tensordict.get(key).index_copy(0, worlds, value))
         return tensordict
+
+
+class MaskedResetEnv(RowResetEnv):
+    """A `TransformedEnv` whose steps and resets never wait for the device.
+
+    How many environments are done is known on the device only. The stack therefore computes a reset of all of them in
+    every step, in tensors of fixed size, and a mask says whose results count. On a CPU, where asking costs nothing,
+    steps in which nobody is done are left alone.
+    """
+
+    def compile_transforms(self, **options: Any) -> None:
+        """Compiles what the transforms do in a step and in a reset; the stack must be complete.
+
+        Args:
+            options: of `torch.compile`.
+        """
+        for name in ("_step", "_reset"):
+            compiled = torch.compile(getattr(self.transform, name), dynamic=False, **options)
+            setattr(self.transform, name, torch.no_grad()(compiled))
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        done = tensordict.get("done")
+        if done.device.type == "cpu" and not done.any():
+            return tensordict
+        part = self.transform._reset_env_preprocess(tensordict.copy())
+        fresh = self.transform._reset(part, self.base_env._reset(part.copy().set("_reset", done)))
+        tensordict, mask = tensordict.copy(), done.reshape(-1)
+        for key, value in fresh.items(True, True):
+            chosen = mask.reshape(-1, *[1] * (value.ndim - 1))
+            tensordict.set(key, torch.where(chosen, value, tensordict.get(key)))
+        return tensordict

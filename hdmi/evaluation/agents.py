@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict
 from tensordict import TensorDictBase
 
 from hdmi.build import ConfigError
@@ -36,6 +36,24 @@ class BlindAgent(torch.nn.Module):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = torch.empty(*tensordict.batch_size, self.action_size, device=tensordict.device)
         return tensordict.set("action", action.uniform_(-self.half_range, self.half_range))
+
+
+def choose_engine(cfg: DictConfig, name: str) -> None:
+    """Changes which engine computes the physics of a config, and nothing else about it.
+
+    Args:
+        name: of a config in conf/sim: `cpu` or `gpu`.
+
+    Raises:
+        ConfigError: if there is no such config.
+    """
+    there = sorted(path.stem for path in (CONF / "sim").glob("*.yaml"))
+    if name not in there:
+        raise ConfigError(f"sim: there is no {name!r}; there is {', '.join(there)}")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        sim = compose("config", overrides=[f"sim={name}"]).sim
+    with open_dict(cfg):
+        cfg.sim.device, cfg.sim.backend = sim.device, sim.backend
 
 
 def task_config(task: str, motion_root: str | None = None) -> DictConfig:

@@ -18,6 +18,7 @@ from torch import Tensor
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
 from hdmi.build import ConfigError, Task, make_env, make_task
+from hdmi.evaluation.agents import choose_engine
 from hdmi.learning.checkpoint import CheckpointError
 from hdmi.learning.policy import load_policy
 from hdmi.motion import Reference
@@ -331,6 +332,7 @@ def evaluate_policy(
         try:
             actor.eval()
             episodes = run_episodes(env, on_device(actor, env.device), horizon, causes)
+            env.base_env.backend.overflows()  # warns
         finally:
             actor.train(was_training)
             env.close()
@@ -356,6 +358,7 @@ def evaluate_checkpoint(
     task: str | None = None,
     motion_root: str | None = None,
     num_threads: int | None = None,
+    sim: str | None = None,
 ) -> EvalResult:
     """Evaluates a checkpoint by `evaluate_policy` and writes eval.json.
 
@@ -364,6 +367,7 @@ def evaluate_checkpoint(
         out: file to write; None for eval.json in the run folder.
         task: that the checkpoint must be of.
         motion_root, num_threads: instead of the training's.
+        sim: engine (`cpu`, `gpu`) instead of the training's.
 
     Raises:
         CheckpointError: if there is no usable checkpoint, or it is of another task.
@@ -375,6 +379,8 @@ def evaluate_checkpoint(
         cfg.motion_root = motion_root
     if num_threads is not None:
         cfg.num_threads = num_threads
+    if sim is not None:
+        choose_engine(cfg, sim)
     values = evaluate_policy(actor, cfg, num_envs, terminations=terminations, seed=seed)
     file = Path(info["file"])
     folder = run_folder_of(file)

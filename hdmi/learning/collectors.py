@@ -37,9 +37,11 @@ class WorldCollector(Collector):
     _carrier: TensorDictBase  # from batch to batch; TorchRL gives no access to it
 
     def state_dict(self) -> dict[str, Any]:  # type: ignore[override]
-        """`rng` of the process, `env` and `transforms`, and the `carrier` [N] from which the next step is made."""
+        """`rng` of the process and its GPU, `env` and `transforms`, and the `carrier` [N] of the next step."""
+        gpu = self.env.device.type == "cuda"
         return {
             "rng": torch.get_rng_state(),
+            "device_rng": torch.cuda.get_rng_state(self.env.device) if gpu else None,
             "env": self.env.base_env.get_state().to_dict(),
             "transforms": dict(self.env.transform.state_dict()),
             "carrier": self._carrier.to_dict(),
@@ -51,6 +53,8 @@ class WorldCollector(Collector):
         self.env.transform.load_state_dict(state_dict["transforms"])
         self._carrier = TensorDict(state_dict["carrier"], self.env.batch_size, device=self._carrier.device)
         torch.set_rng_state(state_dict["rng"].cpu())
+        if state_dict.get("device_rng") is not None and self.env.device.type == "cuda":
+            torch.cuda.set_rng_state(state_dict["device_rng"].cpu(), self.env.device)
 
 
 class InlineCollector:

@@ -151,7 +151,18 @@ class Trainer:
         norm = self.cfg.algo.max_grad_norm
         actor_norm = torch.nn.utils.clip_grad_norm_(self.actor.parameters(), norm)
         critic_norm = torch.nn.utils.clip_grad_norm_(self.critic.parameters(), norm)
-        if not (total.isfinite() and actor_norm.isfinite() and critic_norm.isfinite()):
+        figures = {
+            "loss_actor": losses["loss_objective"],
+            "loss_critic": losses["loss_critic"],
+            "entropy": losses["entropy"],
+            "clip_fraction": losses["clip_fraction"],
+            "kl": kl,
+            "grad_norm_actor": actor_norm,
+        }
+        # the device is waited for once, not for each figure
+        finite = torch.stack([total, actor_norm, critic_norm]).isfinite().all()
+        *values, usable = torch.stack([*(v.detach() for v in figures.values()), finite.to(total.dtype)]).tolist()
+        if not usable:
             self.bad_updates += 1
             if self.bad_updates >= _MAX_BAD_UPDATES:
                 raise DivergenceError(
@@ -163,15 +174,9 @@ class Trainer:
         self.bad_updates = 0
         self.actor_optim.step()
         self.critic_optim.step()
-        self.schedule.step(float(kl))
-        return {
-            "loss_actor": float(losses["loss_objective"].detach()),
-            "loss_critic": float(losses["loss_critic"].detach()),
-            "entropy": float(losses["entropy"]),
-            "clip_fraction": float(losses["clip_fraction"]),
-            "kl": float(kl),
-            "grad_norm_actor": float(actor_norm),
-        }
+        row = dict(zip(figures, values, strict=True))
+        self.schedule.step(row["kl"])
+        return row
 
     # -- the loop ---------------------------------------------------------------------------------------------
 
@@ -207,7 +212,8 @@ class Trainer:
                     start = time.perf_counter()
                     batch = self.collector.next()
                     collected = time.perf_counter()
-                    row = self.ranks.mean_row({**summarize(batch), **self.update(batch)})
+                    figures = {**summarize(batch), **self.update(batch)}
+                    row = self.ranks.mean_row(figures | {"overflows": self.env.base_env.backend.overflows()})
                     end = time.perf_counter()
                     self.elapsed += end - start
                     self.iteration += 1

@@ -84,10 +84,10 @@ class ProjectedGravity(FunctionTransform):
 
     def __init__(self, out_key: NestedKey, root_quat_key: NestedKey = _ROOT_QUAT):
         super().__init__([root_quat_key], [out_key])
+        self.register_buffer("down", torch.tensor([0.0, 0.0, -1.0]), persistent=False)
 
     def function(self, *inputs: Tensor) -> Tensor:
-        down = inputs[0].new_tensor([0.0, 0.0, -1.0])
-        return quat_apply_inverse(inputs[0], down.expand(*inputs[0].shape[:-1], 3))
+        return quat_apply_inverse(inputs[0], self.down.expand(*inputs[0].shape[:-1], 3))
 
 
 class RelativeJointPos(FunctionTransform):

@@ -31,9 +31,15 @@ class ModelRandomization(SpecTransform):
 
     Args:
         per: `episode` draws at every reset; `world` once, at the first reset, so that worlds differ but stay.
+        model: whose `fields` are the nominal ones.
     """
 
-    def __init__(self, per: Literal["episode", "world"] = "episode"):
+    def __init__(
+        self,
+        per: Literal["episode", "world"] = "episode",
+        model: mujoco.MjModel | None = None,
+        fields: Sequence[str] = (),
+    ):
         super().__init__()
         if per not in ("episode", "world"):
             raise ValueError(f"{type(self).__name__}: per is 'episode' or 'world', got {per!r}")
@@ -41,10 +47,21 @@ class ModelRandomization(SpecTransform):
         # of the numbers per world; -1 until the first reset. A buffer, so that a resumed run keeps its worlds.
         self.register_buffer("seed", torch.tensor(-1))
         self._world_rows: dict[NestedKey, Tensor] = {}  # what the seed gives on top of the nominal model
+        for field in fields:
+            values = torch.from_numpy(np.array(getattr(model, field), dtype=np.float32))
+            self.register_buffer(f"nominal_{field}", values, persistent=False)
 
     def draw(self, init: TensorDictBase) -> None:
         """Writes into `init` (batch [N]) what this term randomizes."""
         raise NotImplementedError
+
+    def _rows(self, init: TensorDictBase, field: str) -> Tensor:
+        """A copy of the per-world rows that terms before wrote, or of the nominal model's. [N, ...]"""
+        rows = init.get(("model", field), None)
+        if rows is not None:
+            return rows.clone()
+        nominal = getattr(self, f"nominal_{field}")
+        return nominal.expand(*init.batch_size, *nominal.shape).clone()
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         if tensordict is None:
@@ -85,15 +102,6 @@ class ModelRandomization(SpecTransform):
         return rows
 
 
-def _rows(init: TensorDictBase, model: mujoco.MjModel, field: str) -> Tensor:
-    """A copy of the per-world rows that terms before wrote, or of the model's. [N, ...]"""
-    rows = init.get(("model", field), None)
-    if rows is not None:
-        return rows.clone()
-    base = torch.from_numpy(np.array(getattr(model, field), dtype=np.float32))
-    return base.expand(*init.batch_size, *base.shape).clone()
-
-
 class MassRandomization(ModelRandomization):
     """Scales mass and inertia of bodies, each on its own, or sets the total mass of an object.
 
@@ -111,13 +119,14 @@ class MassRandomization(ModelRandomization):
         mass: Sequence[float] | None = None,
         per: Literal["episode", "world"] = "episode",
     ):
-        super().__init__(per)
+        super().__init__(per, model, ("body_mass", "body_inertia"))
         if (scale is None) == (mass is None):
             raise ValueError("MassRandomization: give either scale or mass")
         names = [model.body(i).name for i in range(model.nbody)]
-        self.bodies = match_names(bodies, names, "MassRandomization.bodies")
-        self.model, self.scale, self.mass = model, scale, mass
-        self.total = float(model.body_mass[self.bodies].sum())
+        index = match_names(bodies, names, "MassRandomization.bodies")
+        self.register_buffer("bodies", torch.as_tensor(index), persistent=False)
+        self.scale, self.mass = scale, mass
+        self.total = float(model.body_mass[index].sum())
 
     def draw(self, init: TensorDictBase) -> None:
         n = init.batch_size[0]
@@ -127,7 +136,7 @@ class MassRandomization(ModelRandomization):
             assert self.scale is not None
             factor = _between(self.scale, (n, len(self.bodies)), init.device)
         for field, shaped in (("body_mass", factor), ("body_inertia", factor.unsqueeze(-1))):
-            rows = _rows(init, self.model, field)
+            rows = self._rows(init, field)
             rows[:, self.bodies] *= shaped
             init.set(("model", field), rows)
 
@@ -142,13 +151,14 @@ class CenterOfMassRandomization(ModelRandomization):
         shift: float,
         per: Literal["episode", "world"] = "episode",
     ):
-        super().__init__(per)
+        super().__init__(per, model, ("body_ipos",))
         names = [model.body(i).name for i in range(model.nbody)]
-        self.bodies = match_names(bodies, names, "CenterOfMassRandomization.bodies")
-        self.model, self.shift = model, shift
+        index = match_names(bodies, names, "CenterOfMassRandomization.bodies")
+        self.register_buffer("bodies", torch.as_tensor(index), persistent=False)
+        self.shift = shift
 
     def draw(self, init: TensorDictBase) -> None:
-        rows = _rows(init, self.model, "body_ipos")
+        rows = self._rows(init, "body_ipos")
         shape = (init.batch_size[0], len(self.bodies), 3)
         rows[:, self.bodies] += _between((-self.shift, self.shift), shape, init.device)
         init.set(("model", "body_ipos"), rows)
@@ -167,14 +177,15 @@ class FrictionRandomization(ModelRandomization):
         friction: Sequence[float],
         per: Literal["episode", "world"] = "episode",
     ):
-        super().__init__(per)
+        super().__init__(per, model, ("geom_friction",))
         names = [model.body(i).name for i in range(model.nbody)]
         wanted = match_names(bodies, names, "FrictionRandomization.bodies")
-        self.geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in wanted]
-        self.model, self.friction = model, friction
+        geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in wanted]
+        self.register_buffer("geoms", torch.as_tensor(geoms), persistent=False)
+        self.friction = friction
 
     def draw(self, init: TensorDictBase) -> None:
-        rows = _rows(init, self.model, "geom_friction")
+        rows = self._rows(init, "geom_friction")
         rows[:, self.geoms, 0] = _between(self.friction, (init.batch_size[0], 1), init.device)
         init.set(("model", "geom_friction"), rows)
 
@@ -201,14 +212,14 @@ class ObjectJointRandomization(ModelRandomization):
         damping: Sequence[float],
         per: Literal["episode", "world"] = "episode",
     ):
-        super().__init__(per)
+        super().__init__(per, model, ("dof_frictionloss", "dof_damping"))
         names = [model.joint(i).name for i in range(model.njnt)]
         self.dof = int(model.jnt_dofadr[match_names([joint], names, "ObjectJointRandomization.joint")[0]])
-        self.model, self.ranges = model, {"dof_frictionloss": friction, "dof_damping": damping}
+        self.ranges = {"dof_frictionloss": friction, "dof_damping": damping}
 
     def draw(self, init: TensorDictBase) -> None:
         for field, span in self.ranges.items():
-            rows = _rows(init, self.model, field)
+            rows = self._rows(init, field)
             rows[:, self.dof] = _between(span, (init.batch_size[0],), init.device)
             init.set(("model", field), rows)
 

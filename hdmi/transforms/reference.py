@@ -101,9 +101,9 @@ def _reference_table(
     r, index = reference, list(bodies)
     root_pos, root_quat = r.body_pos[:, 0], r.body_quat[:, 0]
     pos_local, quat_local = local_pose(r.body_pos[:, index], r.body_quat[:, index], root_pos, root_quat)
-    last = r.num_frames - 1
+    last, frames = r.num_frames - 1, torch.arange(r.num_frames, device=root_pos.device)[:, None]
     table: dict[NestedKey, Tensor] = {
-        ("ref", "phase"): torch.arange(r.num_frames)[:, None] / last,
+        ("ref", "phase"): frames / last,
         ("ref", "joint_pos"): r.joint_pos,
         ("ref", "joint_vel"): r.joint_vel,
         ("ref", "root_pos"): root_pos,
@@ -124,10 +124,10 @@ def _reference_table(
         table[("ref", "contact")] = r.contact
         table[("ref", "contact_point")] = r.contact_point
     if future_steps:
-        ahead = (torch.arange(r.num_frames)[:, None] + torch.as_tensor(list(future_steps))).clamp(max=last)  # [T, F]
+        ahead = (frames + torch.as_tensor(list(future_steps), device=frames.device)).clamp(max=last)  # [T, F]
         table[("ref", "future", "joint_pos")] = r.joint_pos[ahead][..., list(joints)]
         future_pos = r.body_pos[ahead][:, :, index].flatten(1, 2)  # [T, F K, 3]
-        future_local, _ = local_pose(future_pos, torch.zeros(*future_pos.shape[:-1], 4), root_pos, root_quat)
+        future_local, _ = local_pose(future_pos, future_pos.new_zeros(*future_pos.shape[:-1], 4), root_pos, root_quat)
         table[("ref", "future", "body_pos_local")] = future_local.unflatten(1, (len(future_steps), len(index)))
     return table
 
@@ -264,18 +264,18 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
         if self.start == "first":
             return super().sample_frames(batch_size, device)
         bins, total = len(self.failures), self.failures.sum()
-        weights = torch.full_like(self.failures, 1 / bins)
-        if total > 0:
-            weights = self.uniform_share * weights + (1 - self.uniform_share) * self.failures / total
+        uniform = torch.full_like(self.failures, 1 / bins)
+        failing = self.uniform_share * uniform + (1 - self.uniform_share) * self.failures / total
+        weights = torch.where(total > 0, failing, uniform)
         drawn = torch.multinomial(weights, batch_size.numel(), replacement=True).reshape(batch_size)
         within = torch.rand(tuple(batch_size), device=device)
         return ((drawn + within) / bins * self.num_starts).long().clamp(max=self.num_starts - 1)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         terminated = next_tensordict.get("terminated").squeeze(-1)
-        frames = (next_tensordict.get(("ref", "step")).squeeze(-1)[terminated] - self.lead).clamp(min=0)
+        frames = (next_tensordict.get(("ref", "step")).squeeze(-1) - self.lead).clamp(min=0)
         bins = (frames * len(self.failures) // self.num_starts).clamp(max=len(self.failures) - 1)
-        self.failures.mul_(self.decay).index_add_(0, bins, torch.ones_like(bins, dtype=torch.float32))
+        self.failures.mul_(self.decay).index_add_(0, bins, terminated.float())
         return next_tensordict
 
 

@@ -247,7 +247,8 @@ class FeetSlip(RewardTerm):
         reward_key: NestedKey = "reward",
     ):
         super().__init__(name, [velocity_key, force_key], weight, reward_key)
-        self.feet = match_names(feet, body_names, f"reward {name!r}")
+        index = torch.as_tensor(match_names(feet, body_names, f"reward {name!r}"))
+        self.register_buffer("feet", index, persistent=False)
         self.force_threshold = force_threshold
 
     def function(self, *inputs: Tensor) -> Tensor:
