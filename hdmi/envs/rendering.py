@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Callable
@@ -20,6 +21,8 @@ def _choose_gl() -> None:
     """Falls back to EGL where there is no display and the user has not chosen."""
     headless = sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     if headless and "MUJOCO_GL" not in os.environ:
+        # an accelerator that we do not use is missing, says PyOpenGL
+        logging.getLogger("OpenGL.acceleratesupport").setLevel(logging.WARNING)
         from mujoco.egl import GLContext
 
         gl_context.GLContext = GLContext  # where Renderer looks it up
