@@ -247,6 +247,17 @@ class TestBalance:
         )
 
 
+@pytest.mark.parametrize("path", sorted(find_motion("lift_box").parent.iterdir()), ids=lambda path: path.name)
+def test_a_reference_that_ships_is_what_its_plan_says(path):
+    content, motion = load_plan(find_plan(path.name)), load_motion(path)
+    assert motion.num_frames == round(content.duration * FPS)
+    t = np.arange(motion.num_frames) / FPS
+    root = root_path(footprints(content, plan_steps(content), t), t)
+    np.testing.assert_allclose(motion.body_pos_w[:, 0, :2], root.pos[:, :2], atol=0.35)
+    for name, key in content.scenery.items():
+        np.testing.assert_allclose(motion.body_pos_w[0, motion.body_names.index(name)], key.pos, atol=1e-5)
+
+
 class TestMotions:
     @pytest.fixture(scope="class")
     def authored(self):

@@ -111,7 +111,8 @@ def author_motion(
         options=replace(options, self_collision=0.005, tolerance=_TOLERANCE),
         on_frame=None if on_frame is None else lambda t: on_frame(t, len(time)),
     )
-    motion = _motion(plan, result, paths, object, scenery, effectors, contact)
+    points = _contact_points(plan, paths, effectors, hands)
+    motion = _motion(plan, result, paths, object, scenery, contact, points)
     return _report(plan, result, motion, load, paths, time)
 
 
@@ -148,17 +149,17 @@ def _lay_out(
     root = root_path(prints, time)
     pressure = planned_pressure(plan, steps, prints, time)
     height = value_path(plan.pelvis, "height", time, 0.74)
-    zeros = np.zeros(len(time))
     pelvis = root.rot * about("y", value_path(plan.pelvis, "pitch", time, 0.0))
     lean, gaze, roll = (
         value_path(plan.torso, name, time, default) for name, default in (("lean", 0.05), ("gaze", 0.0), ("roll", 0.0))
     )
     torso = root.rot * Rotation.from_euler("xyz", np.column_stack([roll, lean, gaze]))
-    raised = np.column_stack([zeros, zeros, height])
+    # where the body sways to: what hangs from the torso sways along
+    sway = pendulum_com(pressure[:, :2], FPS)
     frames = {
         "world": PosePath.fixed((0.0, 0.0, 0.0), Rotation.identity(), len(time)),
         "root": root,
-        "torso": PosePath(root.pos + raised, torso),
+        "torso": PosePath(np.column_stack([sway, root.pos[:, 2] + height]), torso),
     }
     for item in scenery:
         if item.name not in plan.scenery:
@@ -328,6 +329,18 @@ def _com(paths: _Paths, load: Load, time: np.ndarray) -> np.ndarray:
     return np.column_stack([over, np.zeros(len(time))])
 
 
+def _contact_points(plan: Plan, paths: _Paths, effectors: Sequence[Effector], hands: Sequence[ik.Target]) -> np.ndarray:
+    """The task's targets; on an object that rolls, where the hands touch it, which moves over it. [T, E, 3]"""
+    points = np.empty((len(paths.pressure), len(effectors), 3))
+    for e, effector in enumerate(effectors):
+        points[:, e] = effector.target
+        hand = next((h for h in hands if isinstance(h, ik.PointTarget) and h.body == effector.body), None)
+        if plan.rolls is not None and paths.object is not None and hand is not None:
+            inward = paths.object.rot.inv().apply(np.asarray(hand.pos) - paths.object.pos)
+            points[:, e] = plan.rolls * inward / np.linalg.norm(inward, axis=1, keepdims=True)
+    return points
+
+
 # -- the result -----------------------------------------------------------------------------------------------
 
 
@@ -337,8 +350,8 @@ def _motion(
     paths: _Paths,
     object: ObjectConfig | None,
     scenery: Sequence[SceneryConfig],
-    effectors: Sequence[Effector],
     contact: np.ndarray,
+    points: np.ndarray,
 ) -> Motion:
     """The pelvis, the joints and what is not the robot: the other bodies follow by forward kinematics."""
     bodies = {"pelvis": (result.root_pos, result.root_quat)}
@@ -360,14 +373,13 @@ def _motion(
         "joint_pos": joint_pos,
         "joint_vel": derivative(joint_pos, FPS),
     }
-    points = np.array([effector.target for effector in effectors], np.float32)
     return Motion(
         name=plan.name,
         fps=FPS,
         body_names=tuple(bodies),
         joint_names=tuple(joints),
-        object_contact=contact if len(effectors) else None,
-        contact_points=np.tile(points, (len(pos), 1, 1)) if len(effectors) else None,
+        object_contact=contact if contact.shape[1] else None,
+        contact_points=points.astype(np.float32) if contact.shape[1] else None,
         **{key: value.astype(np.float32) for key, value in arrays.items()},
     )
 
