@@ -121,13 +121,15 @@ class Overlay:
 
     Args:
         ghost: whether to draw the reference.
+        ghost_task: whose reference is drawn instead.
     """
 
-    def __init__(self, task: Task, ghost: bool = True):
+    def __init__(self, task: Task, ghost: bool = True, ghost_task: Task | None = None):
         self.task, self.ghost = task, ghost
+        self._ghost_task = ghost_task
         self._option = mujoco.MjvOption()
         self._perturb = mujoco.MjvPerturb()
-        self._ghost_data = mujoco.MjData(task.scene.model)
+        self._ghost_data = mujoco.MjData((ghost_task or task).scene.model)
 
     def draw(self, moment: Moment, scene: mujoco.MjvScene) -> None:
         """Adds to a scene what belongs to a moment."""
@@ -137,8 +139,12 @@ class Overlay:
             self._draw_contact(moment, scene, e)
 
     def _draw_ghost(self, moment: Moment, scene: mujoco.MjvScene) -> None:
-        model, data, first = moment.model, self._ghost_data, scene.ngeom
-        data.qpos[:] = reference_qpos(self.task.scene, self.task.reference, moment.frame)
+        data, first = self._ghost_data, scene.ngeom
+        task, model = self.task, moment.model  # of the world: objects are randomized in size
+        if self._ghost_task is not None:
+            task, model = self._ghost_task, self._ghost_task.scene.model
+        frame = min(moment.frame, task.reference.num_frames - 1)
+        data.qpos[:] = reference_qpos(task.scene, task.reference, frame)
         mujoco.mj_kinematics(model, data)
         moving = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
         mujoco.mjv_addGeoms(model, data, self._option, self._perturb, moving, scene)

@@ -68,10 +68,10 @@ def checked_fps(where: object, fps: float) -> float:
     """A rate in frames per second.
 
     Raises:
-        MotionError: unless it is finite and positive.
+        MotionError: unless it is from 1 to 1000.
     """
-    if not (np.isfinite(fps) and fps > 0):
-        raise MotionError(f"{where}: fps must be positive, got {fps}")
+    if not 1 <= fps <= 1000:
+        raise MotionError(f"{where}: fps must be from 1 to 1000 frames per second, got {fps}")
     return float(fps)
 
 

@@ -57,7 +57,7 @@ class HumanMotion:
 
     Raises:
         MotionError: for names that are not distinct, wrong shapes, values that are not finite, quaternions that are
-            not unit, a rate or height that is not positive.
+            not unit, a rate or height that cannot be.
     """
 
     name: str
@@ -73,8 +73,8 @@ class HumanMotion:
     def __post_init__(self) -> None:
         where = f"motion {self.name!r}"
         checked_fps(where, self.fps)
-        if not (np.isfinite(self.height) and self.height > 0):
-            raise MotionError(f"{where}: height must be positive, got {self.height}")
+        if not 0.5 <= self.height <= 2.5:
+            raise MotionError(f"{where}: height must be from 0.5 to 2.5 m, got {self.height:g}")
         names = checked_names(where, "joint_names", self.joint_names)
         num_frames = len(np.atleast_1d(self.joint_pos))
         if num_frames < 2:

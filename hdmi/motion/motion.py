@@ -18,14 +18,13 @@ motion.npz, float32, world frame, quaternions wxyz:
 from __future__ import annotations
 
 import json
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from hdmi.motion.check import MotionError, checked, checked_fps, checked_labels, checked_names, checked_quat
+from hdmi.motion.files import existing_file, read_npz, read_text, write_npz, write_text
 from hdmi.motion.kinematics import angular_velocity, derivative
 
 
@@ -53,6 +52,7 @@ class Motion:
 
 _REQUIRED = {"body_pos_w": 3, "body_quat_w": 4, "joint_pos": None}
 _OPTIONAL = {"body_lin_vel_w": 3, "body_ang_vel_w": 3, "joint_vel": None}
+_LABELS = ("object_contact", "contact_points")
 _BECAUSE = " from meta.json and joint_pos"
 
 
@@ -66,22 +66,18 @@ def load_motion(path: str | Path) -> Motion:
     folder = Path(path)
     meta_path, npz_path = folder / "meta.json", folder / "motion.npz"
     for file in (meta_path, npz_path):
-        if not file.is_file():
-            raise MotionError(f"{file}: no such file; a motion is a folder with motion.npz and meta.json")
+        existing_file(file, "; a motion is a folder with motion.npz and meta.json")
+    text = read_text(meta_path)
     try:
-        meta = json.loads(meta_path.read_text(encoding="utf-8"))
+        meta = json.loads(text)
         body_names, joint_names = tuple(meta["body_names"]), tuple(meta["joint_names"])
         fps = float(meta["fps"])
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise MotionError(f"{meta_path}: needs body_names, joint_names and fps: {error!r}") from error
     checked_fps(meta_path, fps)
     body_names = checked_names(meta_path, "body_names", body_names)
     joint_names = checked_names(meta_path, "joint_names", joint_names)
-    try:
-        with np.load(npz_path, allow_pickle=False) as file:
-            arrays = {key: file[key] for key in file.files}
-    except (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        raise MotionError(f"{npz_path}: truncated or not an npz of plain arrays: {error}") from error
+    arrays = read_npz(npz_path, {*_REQUIRED, *_OPTIONAL, *_LABELS})
     for key in _REQUIRED:
         if key not in arrays:
             raise MotionError(f"{npz_path}: lacks {key!r}; it has {sorted(arrays)}")
@@ -120,14 +116,13 @@ def load_motion(path: str | Path) -> Motion:
 def save_motion(motion: Motion, path: str | Path) -> Path:
     """Writes a motion folder that `load_motion` reads back unchanged; returns the folder."""
     folder = Path(path)
-    folder.mkdir(parents=True, exist_ok=True)
     arrays = {key: getattr(motion, key) for key in (*_REQUIRED, *_OPTIONAL)}
     arrays = {key: value.astype(np.float32) for key, value in arrays.items()}
     if motion.object_contact is not None:
         arrays["object_contact"] = motion.object_contact
     if motion.contact_points is not None:
         arrays["contact_points"] = motion.contact_points.astype(np.float32)
-    np.savez_compressed(folder / "motion.npz", **arrays)
+    write_npz(folder / "motion.npz", arrays)
     meta = {"body_names": list(motion.body_names), "joint_names": list(motion.joint_names), "fps": motion.fps}
-    (folder / "meta.json").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
+    write_text(folder / "meta.json", json.dumps(meta, indent=1) + "\n")
     return folder

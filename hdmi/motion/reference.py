@@ -102,32 +102,13 @@ def make_reference(
     """
     motion = motion if isinstance(motion, Motion) else load_motion(motion)
     where = f"motion {motion.name!r}"
-    if "pelvis" not in motion.body_names:
-        raise MotionError(f"{where}: body_names lacks the root 'pelvis'")
     hinge = object.hinge.name if object is not None and object.hinge is not None else None
     unknown = [name for name in motion.joint_names if name not in (*g1.JOINT_NAMES, _ROOT_JOINT, hinge)]
     if unknown:
         raise MotionError(f"{where}: joint_names: {unknown} are neither the robot's nor the object's hinge ({hinge!r})")
-    if not any(name in g1.JOINT_NAMES for name in motion.joint_names):
-        raise MotionError(f"{where}: joint_names has no joint of the robot")
-    motion = resample(motion, 1.0 / control_dt)
-    fps, num_frames = motion.fps, motion.num_frames
-
-    joint_pos = np.tile(default_joint_pos(), (num_frames, 1))
-    joint_vel = np.zeros_like(joint_pos)
-    for i, name in enumerate(motion.joint_names):
-        if name in g1.JOINT_NAMES:
-            j = g1.JOINT_NAMES.index(name)
-            joint_pos[:, j], joint_vel[:, j] = motion.joint_pos[:, i], motion.joint_vel[:, i]
-
-    root = motion.body_names.index("pelvis")
-    body_pos, body_quat = forward_kinematics(motion.body_pos_w[:, root], motion.body_quat_w[:, root], joint_pos)
-    body_lin_vel, body_ang_vel = derivative(body_pos, fps), angular_velocity(body_quat, fps)
-    for b, name in enumerate(g1.BODY_NAMES):
-        if name in motion.body_names:
-            i = motion.body_names.index(name)
-            body_pos[:, b], body_quat[:, b] = motion.body_pos_w[:, i], motion.body_quat_w[:, i]
-            body_lin_vel[:, b], body_ang_vel[:, b] = motion.body_lin_vel_w[:, i], motion.body_ang_vel_w[:, i]
+    motion = complete_robot(resample(motion, 1.0 / control_dt))
+    num_frames = motion.num_frames
+    num_joints, num_bodies = len(g1.JOINT_NAMES), len(g1.BODY_NAMES)
 
     empty = np.zeros((num_frames, 0))
     object_state = [empty] * 4
@@ -158,12 +139,12 @@ def make_reference(
 
     return Reference(
         name=motion.name,
-        joint_pos=tensor(joint_pos),
-        joint_vel=tensor(joint_vel),
-        body_pos=tensor(body_pos),
-        body_quat=tensor(body_quat),
-        body_lin_vel=tensor(body_lin_vel),
-        body_ang_vel=tensor(body_ang_vel),
+        joint_pos=tensor(motion.joint_pos[:, :num_joints]),
+        joint_vel=tensor(motion.joint_vel[:, :num_joints]),
+        body_pos=tensor(motion.body_pos_w[:, :num_bodies]),
+        body_quat=tensor(motion.body_quat_w[:, :num_bodies]),
+        body_lin_vel=tensor(motion.body_lin_vel_w[:, :num_bodies]),
+        body_ang_vel=tensor(motion.body_ang_vel_w[:, :num_bodies]),
         object_pos=tensor(object_state[0]),
         object_quat=tensor(object_state[1]),
         object_lin_vel=tensor(object_state[2]),
@@ -173,6 +154,55 @@ def make_reference(
         contact=torch.from_numpy(contact.copy()),
         contact_point=tensor(points),
         placements=placements,
+    )
+
+
+def complete_robot(motion: Motion) -> Motion:
+    """The motion with all joints and bodies of the robot table, first and in its order; others follow.
+
+    Joints that it lacks hold the default pose, bodies that it lacks come from forward kinematics.
+
+    Raises:
+        MotionError: if it lacks the pelvis, or has no joint of the robot.
+    """
+    where = f"motion {motion.name!r}"
+    if "pelvis" not in motion.body_names:
+        raise MotionError(f"{where}: body_names lacks the root 'pelvis'")
+    if not any(name in g1.JOINT_NAMES for name in motion.joint_names):
+        raise MotionError(f"{where}: joint_names has no joint of the robot")
+    fps, num_frames = motion.fps, motion.num_frames
+    joint_pos = np.tile(default_joint_pos(), (num_frames, 1))
+    joint_vel = np.zeros_like(joint_pos)
+    for i, name in enumerate(motion.joint_names):
+        if name in g1.JOINT_NAMES:
+            j = g1.JOINT_NAMES.index(name)
+            joint_pos[:, j], joint_vel[:, j] = motion.joint_pos[:, i], motion.joint_vel[:, i]
+
+    root = motion.body_names.index("pelvis")
+    pos, quat = forward_kinematics(motion.body_pos_w[:, root], motion.body_quat_w[:, root], joint_pos)
+    lin_vel, ang_vel = derivative(pos, fps), angular_velocity(quat, fps)
+    for b, name in enumerate(g1.BODY_NAMES):
+        if name in motion.body_names:
+            i = motion.body_names.index(name)
+            pos[:, b], quat[:, b] = motion.body_pos_w[:, i], motion.body_quat_w[:, i]
+            lin_vel[:, b], ang_vel[:, b] = motion.body_lin_vel_w[:, i], motion.body_ang_vel_w[:, i]
+
+    joints = [i for i, name in enumerate(motion.joint_names) if name not in g1.JOINT_NAMES]
+    bodies = [i for i, name in enumerate(motion.body_names) if name not in g1.BODY_NAMES]
+
+    def joined(table: np.ndarray, others: np.ndarray) -> np.ndarray:
+        return np.concatenate([table.astype(np.float32), others], axis=1)
+
+    return replace(
+        motion,
+        joint_names=(*g1.JOINT_NAMES, *(motion.joint_names[i] for i in joints)),
+        body_names=(*g1.BODY_NAMES, *(motion.body_names[i] for i in bodies)),
+        joint_pos=joined(joint_pos, motion.joint_pos[:, joints]),
+        joint_vel=joined(joint_vel, motion.joint_vel[:, joints]),
+        body_pos_w=joined(pos, motion.body_pos_w[:, bodies]),
+        body_quat_w=joined(quat, motion.body_quat_w[:, bodies]),
+        body_lin_vel_w=joined(lin_vel, motion.body_lin_vel_w[:, bodies]),
+        body_ang_vel_w=joined(ang_vel, motion.body_ang_vel_w[:, bodies]),
     )
 
 

@@ -6,8 +6,6 @@ it. Whoever has the body model's own file can take its joints instead (`body_mod
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hdmi.motion.check import MotionError
+from hdmi.motion.files import read_npz
 from hdmi.motion.human import SMPL_JOINTS, SMPL_PARENTS, HumanMotion
 
 # Rest positions in shares of the height: upright T-pose on the ground, x left, y up, z forward.
@@ -117,19 +116,16 @@ def body_model_skeleton(path: str | Path, betas: np.ndarray | Sequence[float] = 
     Raises:
         MotionError: if the file is not such a model.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            template, directions, regressor, tree = (
-                np.asarray(file[key]) for key in ("v_template", "shapedirs", "J_regressor", "kintree_table")
-            )
-    except (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        raise MotionError(
-            f"{path}: not a body model's npz with plain arrays v_template, shapedirs, J_regressor and kintree_table: "
-            f"{error}"
-        ) from error
+    keys = ("v_template", "shapedirs", "J_regressor", "kintree_table")
+    arrays = read_npz(path, keys)
+    if missing := [key for key in keys if key not in arrays]:
+        raise MotionError(f"{path}: not a body model: lacks {', '.join(missing)}")
+    template, directions, regressor, tree = (arrays[key] for key in keys)
+    if any(array.dtype.kind not in "fiu" for array in arrays.values()):
+        raise MotionError(f"{path}: not a body model: {', '.join(keys)} must be numbers")
     joints, vertices = len(SMPL_JOINTS), len(np.atleast_1d(template))
     shapes = (template.shape, directions.shape[:2], regressor.shape[1:], tree.shape[:1])
-    if shapes != ((vertices, 3), (vertices, 3), (vertices,), (2,)) or directions.ndim != 3:
+    if shapes != ((vertices, 3), (vertices, 3), (vertices,), (2,)) or directions.ndim != 3 or len(regressor) < joints:
         raise MotionError(f"{path}: shapes of v_template, shapedirs, J_regressor and kintree_table do not agree")
     parents = tuple(int(np.int32(np.uint32(p & 0xFFFFFFFF))) for p in tree[0, :joints].astype(np.int64))
     if (-1, *parents[1:]) != SMPL_PARENTS:
@@ -178,6 +174,27 @@ def z_up_quat(quat: np.ndarray) -> np.ndarray:
     turn = Rotation.from_euler("x", 90, degrees=True)
     turned = turn * Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True)
     return turned.as_quat(scalar_first=True).reshape(quat.shape)
+
+
+def height_from_legs(joint_names: Sequence[str], joint_pos: np.ndarray) -> float:
+    """Height of a person from the length of the legs: thigh and shank are 0.491 of it (`_REST`).
+
+    Args:
+        joint_pos: m. [T, J, 3]
+
+    Raises:
+        MotionError: without hip, knee and ankle of a side.
+    """
+    lengths = []
+    for side in ("left", "right"):
+        parts = [f"{side}_{part}" for part in ("hip", "knee", "ankle")]
+        if all(part in joint_names for part in parts):
+            hip, knee, ankle = (joint_pos[:, list(joint_names).index(part)] for part in parts)
+            length = np.linalg.norm(hip - knee, axis=-1) + np.linalg.norm(knee - ankle, axis=-1)
+            lengths.append(np.median(length))
+    if not lengths:
+        raise MotionError("height: cannot be told from the legs without hip, knee and ankle; give it")
+    return float(np.mean(lengths)) / (_REST["hip"][1] - _REST["ankle"][1])
 
 
 def stand_on_ground(motion: HumanMotion) -> HumanMotion:

@@ -219,13 +219,13 @@ def missing_parts(playback: Playback, described: Sequence[str]) -> list[str]:
         notes.append(f"{len(absent)} joints are absent and hold the default pose: {', '.join(absent)}")
     known = {*g1.BODY_NAMES, *described}
     # bodies of other robot descriptions stand for no object: they are rigid with the robot's
-    unknown = [name for name in motion.body_names if name not in known and not _moves_with_robot(playback, name)]
+    unknown = [name for name in motion.body_names if name not in known and not moves_with_robot(playback, name)]
     if unknown:
         notes.append(f"no geometry is known of {', '.join(unknown)}: name the task that describes them")
     return notes
 
 
-def _moves_with_robot(playback: Playback, name: str) -> bool:
+def moves_with_robot(playback: Playback, name: str) -> bool:
     """Whether a body moves, and keeps its distance from one of the robot's all along."""
     motion = playback.motion
     pos = motion.body_pos_w[:, motion.body_names.index(name)]

@@ -1,0 +1,107 @@
+"""A motion to look at: whose object it has, and what goes wrong in it when."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from hdmi.assets import ObjectConfig, SceneryConfig, g1
+from hdmi.build import scene_parts
+from hdmi.evaluation.agents import CONF, task_config
+from hdmi.motion import Motion, load_motion
+from hdmi.motion.playback import Playback, make_playback
+from hdmi.motion.validate.checks import contact_positions, limits, moves_with_robot
+
+_CUBE = (0.05, 0.05, 0.05)  # half extents of an object that no task describes, m
+
+
+def load_view(path: str | Path, task: str | None = None) -> tuple[Playback, str]:
+    """The motion in a folder, in the scene of a task.
+
+    Args:
+        task: whose object, scenery and effectors to show; None takes the task of this motion, else one whose object it
+            has. Without any, the body that moves most is shown as a cube, and the others as cubes at their first pose.
+
+    Returns:
+        The motion in its scene, and a line that says what was taken.
+
+    Raises:
+        MotionError: if the motion cannot be read, or does not fit the task.
+        ConfigError: if there is no such task.
+    """
+    motion = load_motion(path)
+    name = task or _task_of(motion)
+    if name is not None:
+        return make_playback(motion, **scene_parts(task_config(name))), f"object and effectors of task {name}"
+    return _bare_playback(motion), "no task has its object: drawn as cubes; task=NAME takes a task's object"
+
+
+def _task_of(motion: Motion) -> str | None:
+    tasks = sorted(path.stem for path in (CONF / "task").glob("*.yaml"))
+    for name in tasks:
+        if OmegaConf.select(OmegaConf.load(CONF / "task" / f"{name}.yaml"), "task.motion") == motion.name:
+            return name
+    for name in tasks:
+        thing = task_config(name).task.object
+        if thing is not None and thing.name in motion.body_names:
+            return name
+    return None
+
+
+def _bare_playback(motion: Motion) -> Playback:
+    keep = [j for j, name in enumerate(motion.joint_names) if name in g1.JOINT_NAMES]
+    motion = replace(
+        motion,
+        joint_names=tuple(motion.joint_names[j] for j in keep),
+        joint_pos=motion.joint_pos[:, keep],
+        joint_vel=motion.joint_vel[:, keep],
+    )
+    robot = make_playback(motion)
+    others = [name for name in motion.body_names if name not in g1.BODY_NAMES and not moves_with_robot(robot, name)]
+    if not others:
+        return robot
+    travel = np.ptp(motion.body_pos_w, axis=0).max(axis=-1)
+    others.sort(key=lambda name: -float(travel[motion.body_names.index(name)]))
+    cube = [{"box": _CUBE}]
+    return make_playback(
+        motion, object=ObjectConfig(others[0], cube), scenery=[SceneryConfig(name, cube) for name in others[1:]]
+    )
+
+
+def curves(playback: Playback, other: Playback | None = None) -> Mapping[str, np.ndarray]:
+    """What is plotted over time. Each [T], NaN where it does not apply.
+
+    Height of the robot's lowest point over the ground, the deepest that it is inside the object, the distance of each
+    effector from its contact point while contact is intended, and the fastest joint in percent of its limit. Against
+    another motion of the same rate: mean errors of bodies and joints, and of the object if both have one.
+    """
+    reference, scene = playback.reference, playback.scene
+    found = {"ground clearance [cm]": 100 * playback.ground_distance.min(axis=1)}
+    if scene.object_geoms.size:
+        found["inside the object [cm]"] = 100 * (-playback.object_distance).clip(min=0).max(axis=1)
+    if scene.effectors:
+        point, target = contact_positions(playback)
+        gaps = np.where(reference.contact.numpy(), 100 * np.linalg.norm(point - target, axis=-1), np.nan)
+        names = [effector.body.removesuffix("_link") for effector in scene.effectors]
+        found |= {f"contact gap, {name} [cm]": gap for name, gap in zip(names, gaps.T, strict=True)}
+    found["joint speed [%]"] = 100 * limits(playback)["joint_velocity"].values.max(axis=1)
+    if other is not None:
+        found |= _differences(playback, other)
+    return found
+
+
+def _differences(playback: Playback, other: Playback) -> dict[str, np.ndarray]:
+    ours, theirs = playback.reference, other.reference
+    count = min(ours.num_frames, theirs.num_frames)
+    errors = {
+        "body error [cm]": 100 * (ours.body_pos[:count] - theirs.body_pos[:count]).norm(dim=-1).mean(-1),
+        "joint error [deg]": (ours.joint_pos[:count] - theirs.joint_pos[:count]).abs().mean(-1).rad2deg(),
+    }
+    if ours.has_object and theirs.has_object:
+        errors["object error [cm]"] = 100 * (ours.object_pos[:count] - theirs.object_pos[:count]).norm(dim=-1)
+    pad = np.full(ours.num_frames - count, np.nan)
+    return {name: np.concatenate([values.numpy(), pad]) for name, values in errors.items()}

@@ -1,0 +1,35 @@
+"""Readers of other people's motions: of persons into `HumanMotion`, of robots into `Motion` and back.
+
+Files are data, never programs: pickles are refused, damaged files end in a MotionError that names file, field and
+frame.
+"""
+
+from hdmi.motion.sources.bvh import read_bvh
+from hdmi.motion.sources.formats import FORMATS, convert, guess_format
+from hdmi.motion.sources.interaction import read_intermimic, read_omomo
+from hdmi.motion.sources.robot import (
+    read_holosoma,
+    read_mjlab,
+    read_robot_csv,
+    write_holosoma,
+    write_mjlab,
+    write_robot_csv,
+)
+from hdmi.motion.sources.smpl import read_amass, read_gvhmr
+
+__all__ = [
+    "FORMATS",
+    "convert",
+    "guess_format",
+    "read_amass",
+    "read_bvh",
+    "read_gvhmr",
+    "read_holosoma",
+    "read_intermimic",
+    "read_mjlab",
+    "read_omomo",
+    "read_robot_csv",
+    "write_holosoma",
+    "write_mjlab",
+    "write_robot_csv",
+]
