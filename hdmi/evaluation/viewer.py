@@ -87,7 +87,8 @@ class ReferenceViewer:
                 self._plotted(values),
                 ({"label": "s"}, {"label": name, "stroke": color, "width": 1.5}, {"label": "now", "stroke": _NOW}),
                 title=name,
-                scales={"x": {"time": False}},
+                # given, since uPlot finds none where values are missing
+                scales={"x": {"time": False}, "y": {"auto": False, "range": _span(values)}},
                 legend={"show": False},
                 aspect=2.6,
             )
@@ -110,11 +111,9 @@ class ReferenceViewer:
     def _plotted(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
         """Time, the curve, and a line from its bottom to its top at the present frame."""
         now = np.full(len(values), np.nan)
-        finite = values[np.isfinite(values)]
-        low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
         # a series has one value at a time: the line goes from this frame's to the next one's
         at = min(self.frame, len(values) - 2)
-        now[at : at + 2] = low, high
+        now[at : at + 2] = _span(values)
         return self._time, values, now
 
     def show(self, frame: int) -> None:
@@ -158,6 +157,14 @@ class ReferenceViewer:
         self.server.stop()
 
 
+def _span(values: np.ndarray) -> tuple[float, float]:
+    """What a plot shows of a curve: all of it, and a margin."""
+    finite = values[np.isfinite(values)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+    margin = 0.05 * (high - low) or 1.0
+    return low - margin, high + margin
+
+
 def _add_bodies(server: Any, root: str, model: mujoco.MjModel, color: tuple[int, int, int] | None) -> dict[int, Any]:
     """A frame for each body with something to see; returns them by the body's number."""
     frames: dict[int, Any] = {}
@@ -174,6 +181,7 @@ def _add_bodies(server: Any, root: str, model: mujoco.MjModel, color: tuple[int,
             faces=np.asarray(mesh.faces, np.uint32),
             color=color or tuple(int(255 * c) for c in model.geom_rgba[geom, :3]),
             opacity=None if color is None else 0.25,
+            flat_shading=bool(model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX),
             position=model.geom_pos[geom],
             wxyz=model.geom_quat[geom],
         )
