@@ -180,6 +180,7 @@ def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
         "reference": task.reference,
         "model": task.scene.model,
         "effectors": task.scene.effectors,
+        "object_geoms": task.scene.object_geoms,
         "control_dt": task.scene.sim.control_dt,
         "decimation": task.scene.sim.decimation,
     }

@@ -16,6 +16,7 @@ from hdmi.functional import (
     feet_air_time,
     feet_impact,
     feet_slip,
+    feet_stumble,
     interaction,
     limit_excess,
     local_pose,
@@ -112,6 +113,14 @@ def test_feet_slip_counts_the_horizontal_speed_of_loaded_feet():
     close(feet_slip(velocity, torch.tensor([loaded, unloaded]), force_threshold=20.0), [0.5])
     close(feet_slip(velocity, torch.tensor([loaded, loaded]), force_threshold=20.0), [1.5])
     close(feet_slip(velocity, torch.tensor([unloaded, unloaded]), force_threshold=20.0), [0.0])
+
+
+def test_feet_stumble_counts_feet_pushed_sideways_more_than_they_carry():
+    edge, push, stand, air = [30.0, 40.0, 5.0], [0.0, -90.0, -20.0], [100.0, 0.0, 300.0], [0.0, 0.0, 0.0]
+    close(feet_stumble(torch.tensor([edge, stand]), ratio=4.0), [1.0])  # 50 N against 4 x 5 N
+    close(feet_stumble(torch.tensor([edge, push]), ratio=4.0), [2.0])  # 90 N against 4 x 20 N
+    close(feet_stumble(torch.tensor([push, stand]), ratio=5.0), [0.0])
+    close(feet_stumble(torch.tensor([[air, air], [stand, air]]), ratio=4.0), [[0.0], [0.0]])
 
 
 def test_feet_air_time_charges_short_swings_at_touchdown():

@@ -102,6 +102,7 @@ CASES: dict[str, Case] = {
     "FeetSlip": Case(
         lambda: T.FeetSlip(force_threshold=0.5), "reward", (("robot", "body_lin_vel"), ("robot", "foot_force"))
     ),
+    "FeetStumble": Case(lambda: T.FeetStumble(ratio=1.0), "reward", (("robot", "foot_force"),)),
     "FeetState": Case(lambda: T.FeetState(0.02, force_threshold=1.5), "state", (("robot", "foot_force"),)),
     "Flatten": Case(lambda: T.Flatten(CONTACT[2], "out"), "function", (CONTACT[2],)),
     "FrictionRandomization": Case(

@@ -641,6 +641,11 @@ TERMS = {
         {("robot", "body_lin_vel"): [[9.0, 9, 9], [0.3, 0.4, 7.0], [1.0, 0, 0]], ("robot", "foot_force"): FORCE},
         0.5,
     ),
+    "feet_stumble": (
+        lambda: T.FeetStumble("t", ratio=2.0),
+        {("robot", "foot_force"): [[6.0, 8.0, -4.0], [6.0, 8.0, 6.0]]},  # 10 N sideways against 8 N and 12 N
+        1.0,
+    ),
     "feet_air_time": (
         lambda: T.FeetAirTime("t", threshold=0.4),
         {("feet", "swing_time"): [0.1, 0.3], ("feet", "touchdown"): [True, False]},

@@ -164,7 +164,7 @@ def add_geoms(
     body: mujoco.MjsBody,
     geoms: Sequence[Any],
     *,
-    mass: float | None,
+    mass: float,
     friction: float,
     rgba: Sequence[float],
     torsional_friction: float = 0.0,
@@ -206,10 +206,9 @@ def add_geoms(
         size = np.zeros(3)
         size[: len(values)] = values
         added.append((body.add_geom(type=_SHAPES[shapes[0]], size=size, **kwargs), _volume(shapes[0], values)))
-    if mass is not None:
-        total = sum(volume for _, volume in added)
-        for geom, volume in added:
-            geom.mass = mass * volume / total
+    total = sum(volume for _, volume in added)
+    for geom, volume in added:
+        geom.mass = mass * volume / total
 
 
 def _volume(shape: str, size: np.ndarray) -> float:
@@ -228,7 +227,8 @@ def add_object(spec: mujoco.MjSpec, config: ObjectConfig, pos: Sequence[float], 
     if not config.fixed_base:
         body.add_freejoint(name="object_root")
     hinge = config.hinge
-    base_mass = None if config.fixed_base else config.mass * (1.0 if hinge is None else 0.5)
+    # what is fixed in the world needs no mass, and the object's is then that of its link
+    base_mass = 0.0 if config.fixed_base else config.mass * (1.0 if hinge is None else 0.5)
     surface: dict[str, Any] = {
         "friction": config.friction,
         "torsional_friction": config.torsional_friction,
@@ -255,4 +255,4 @@ def add_object(spec: mujoco.MjSpec, config: ObjectConfig, pos: Sequence[float], 
 def add_scenery(spec: mujoco.MjSpec, config: SceneryConfig, pos: Sequence[float], quat: Sequence[float]) -> None:
     """Adds a static body at a pose."""
     body = spec.worldbody.add_body(name=config.name, pos=pos, quat=quat)
-    add_geoms(spec, body, config.geoms, mass=None, friction=config.friction, rgba=config.rgba)
+    add_geoms(spec, body, config.geoms, mass=0.0, friction=config.friction, rgba=config.rgba)

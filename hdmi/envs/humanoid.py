@@ -108,7 +108,11 @@ class HumanoidObjectEnv(EnvBase):
         self._foot_sensors = constant(scene.foot_sensors)
         self._effector_sensors = constant(scene.effector_sensors)
         self._object_geoms = _slice(scene.object_geoms) if len(scene.object_geoms) else slice(0)
-        self._geom_base = {f: constant(getattr(model, f)[self._object_geoms]) for f in ("geom_size", "geom_pos")}
+        # what grows with the object: fields of its geoms, and where its link is hinged
+        self._scaled = {"geom_size": self._object_geoms, "geom_pos": self._object_geoms}
+        if scene.object_link is not None and scene.num_object_joints:
+            self._scaled["body_pos"] = slice(scene.object_link, scene.object_link + 1)
+        self._unscaled = {field: constant(getattr(model, field)[index]) for field, index in self._scaled.items()}
         bodies = sorted({i for i in (scene.object_body, scene.object_link) if i is not None})
         self._object_bodies = constant(np.array(bodies, dtype=np.int64))
 
@@ -284,8 +288,8 @@ class HumanoidObjectEnv(EnvBase):
         scale = init.get("object_scale", None)
         if scale is not None and self._changes("object_scale", worlds, scale):
             assign(self._object_scale, worlds, scale)
-            for field, base in self._geom_base.items():
-                assign(self.backend.model(field)[:, self._object_geoms], worlds, scale.unsqueeze(-1) * base)
+            for field, index in self._scaled.items():
+                assign(self.backend.model(field)[:, index], worlds, scale.unsqueeze(-1) * self._unscaled[field])
             commit = True
         if commit:
             self.backend.commit_model(worlds)

@@ -28,6 +28,12 @@ def _choose_gl() -> None:
         gl_context.GLContext = GLContext  # where Renderer looks it up
 
 
+def look_at(data: mujoco.MjData) -> np.ndarray:
+    """Where a camera looks that follows the robot: steadily at standing height, higher where the robot climbs. [3]"""
+    x, y, z = data.body("pelvis").xpos
+    return np.array([x, y, max(0.75, z - 0.1)])
+
+
 class WorldRenderer:
     """Renders worlds of one model with a camera that follows the robot's pelvis.
 
@@ -63,15 +69,31 @@ class WorldRenderer:
             self._renderer.close()
             self._renderer = mujoco.Renderer(model, height, width)
             self._size = (height, width)
-        pelvis = data.body("pelvis").xpos
-        self._camera.lookat[:] = [pelvis[0], pelvis[1], 0.75]
-        # of the model that is given, not the one that the renderer was made with: worlds differ in size
-        catmask = int(mujoco.mjtCatBit.mjCAT_ALL)
-        mujoco.mjv_updateScene(model, data, self._option, None, self._camera, catmask, self._renderer.scene)
+        self._update(model, data)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         if draw is not None:
             draw(self._renderer.scene)
         return self._renderer.render().copy()
+
+    def turn(self, azimuth: float) -> None:
+        """Looks along another direction from now on, degrees from the world's x axis."""
+        self._camera.azimuth = azimuth
+
+    def visible(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+        """Pixels that each geom has in the picture. int64 [ngeom]"""
+        self._update(model, data)
+        self._renderer.enable_segmentation_rendering()
+        try:
+            ids, kinds = np.moveaxis(self._renderer.render(), -1, 0)
+        finally:
+            self._renderer.disable_segmentation_rendering()
+        return np.bincount(ids[kinds == mujoco.mjtObj.mjOBJ_GEOM], minlength=model.ngeom)
+
+    def _update(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self._camera.lookat[:] = look_at(data)
+        # of the model that is given, not the one that the renderer was made with: worlds differ in size
+        catmask = int(mujoco.mjtCatBit.mjCAT_ALL)
+        mujoco.mjv_updateScene(model, data, self._option, None, self._camera, catmask, self._renderer.scene)
 
     def close(self) -> None:
         """Frees the OpenGL context."""

@@ -30,6 +30,7 @@ INDEPENDENT_FIELDS = (
     "body_inertia",
     "body_ipos",
     "body_iquat",
+    "body_pos",
     "dof_armature",
     "dof_damping",
     "dof_frictionloss",

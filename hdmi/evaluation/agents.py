@@ -56,14 +56,18 @@ def choose_engine(cfg: DictConfig, name: str) -> None:
         cfg.sim.device, cfg.sim.backend = sim.device, sim.backend
 
 
+def task_names() -> list[str]:
+    """The tasks of conf/task."""
+    return sorted(path.stem for path in (CONF / "task").glob("*.yaml"))
+
+
 def task_config(task: str, motion_root: str | None = None) -> DictConfig:
     """The default config with a task.
 
     Raises:
         ConfigError: if there is no such task.
     """
-    tasks = sorted(path.stem for path in (CONF / "task").glob("*.yaml"))
-    if task not in tasks:
+    if task not in (tasks := task_names()):
         raise ConfigError(f"task: there is no {task!r}; there is {', '.join(tasks)}")
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = compose("config", overrides=[f"task={task}"])

@@ -45,6 +45,7 @@ UNITS = {
     "root_ori_error": "rad",
     "object_pos_error": "m",
     "object_ori_error": "rad",
+    "object_joint_error": "rad",
 }
 _MADE, _INTENDED = "contact_made", "contact_intended"
 _NOT_TERMINATIONS = ("motion_end", "step_count")  # in the group, but no failures

@@ -19,7 +19,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
 from hdmi.build import Task, make_task
-from hdmi.envs.rendering import WorldRenderer
+from hdmi.envs.rendering import WorldRenderer, look_at
 from hdmi.evaluation.protocol import (
     Policy,
     evaluation_config,
@@ -277,7 +277,7 @@ def show(moments: Iterable[Moment], overlay: Overlay, control_dt: float) -> None
             with window.lock():
                 data.qpos[:], data.qvel[:], data.ctrl[:] = moment.data.qpos, moment.data.qvel, moment.data.ctrl
                 mujoco.mj_forward(moment.model, data)
-                window.cam.lookat[:] = [*data.body("pelvis").xpos[:2], 0.75]
+                window.cam.lookat[:] = look_at(data)
                 window.user_scn.ngeom = 0
                 overlay.draw(moment, window.user_scn)
             window.sync()

@@ -92,6 +92,20 @@ def feet_slip(foot_lin_vel_w: Tensor, force: Tensor, *, force_threshold: float) 
     return (foot_lin_vel_w[..., :2].norm(dim=-1) * loaded).sum(-1, keepdim=True)
 
 
+def feet_stumble(force: Tensor, *, ratio: float) -> Tensor:
+    """Number of feet that run into something: pushed sideways more than they carry.
+
+    Args:
+        force: on each foot, world frame, N. [..., 2, 3]
+        ratio: of horizontal to vertical force above which a foot stumbles; more than friction can give.
+
+    Returns:
+        [..., 1]
+    """
+    stumbles = force[..., :2].norm(dim=-1) > ratio * force[..., 2].abs()
+    return stumbles.sum(-1, keepdim=True).to(force.dtype)
+
+
 def feet_air_time(air_time: Tensor, touchdown: Tensor, *, threshold: float) -> Tensor:
     """Shortfall of each swing below `threshold` seconds, charged at touchdown: many little steps cost, none do not.
 

@@ -127,6 +127,8 @@ class MassRandomization(ModelRandomization):
         self.register_buffer("bodies", torch.as_tensor(index), persistent=False)
         self.scale, self.mass = scale, mass
         self.total = float(model.body_mass[index].sum())
+        if self.total <= 0:
+            raise ValueError(f"MassRandomization: {list(bodies)} are static and have no mass")
 
     def draw(self, init: TensorDictBase) -> None:
         n = init.batch_size[0]
@@ -191,10 +193,22 @@ class FrictionRandomization(ModelRandomization):
 
 
 class ObjectScale(ModelRandomization):
-    """Scales the object's geoms about its body's origin; contact points scale with it. Writes `init/object_scale`."""
+    """Scales the object about its body's origin: geoms, hinge and contact points. Writes `init/object_scale`.
 
-    def __init__(self, scale: Sequence[float], per: Literal["episode", "world"] = "episode"):
+    Raises:
+        ValueError: for an object with meshes, which MuJoCo cannot scale per world.
+    """
+
+    def __init__(
+        self,
+        scale: Sequence[float],
+        per: Literal["episode", "world"] = "episode",
+        model: mujoco.MjModel | None = None,
+        object_geoms: Sequence[int] = (),
+    ):
         super().__init__(per)
+        if model is not None and (model.geom_type[object_geoms] == mujoco.mjtGeom.mjGEOM_MESH).any():
+            raise ValueError("a mesh cannot be scaled per world: leave this node out (randomization.object_scale=null)")
         self.range = scale
 
     def draw(self, init: TensorDictBase) -> None:

@@ -256,6 +256,24 @@ class FeetSlip(RewardTerm):
         return F.feet_slip(velocity[..., self.feet, :], force, force_threshold=self.force_threshold)
 
 
+class FeetStumble(RewardTerm):
+    """Feet that run into the edge of a step; see `functional.feet_stumble`. Reads `robot/foot_force` [N, 2, 3]."""
+
+    def __init__(
+        self,
+        name: str = "feet_stumble",
+        weight: float = -1.0,
+        ratio: float = 4.0,
+        force_key: NestedKey = ("robot", "foot_force"),
+        reward_key: NestedKey = "reward",
+    ):
+        super().__init__(name, [force_key], weight, reward_key)
+        self.ratio = ratio
+
+    def function(self, *inputs: Tensor) -> Tensor:
+        return F.feet_stumble(inputs[0], ratio=self.ratio)
+
+
 class FeetAirTime(RewardTerm):
     """Swings shorter than a threshold; see `functional.feet_air_time`."""
 

@@ -1,0 +1,288 @@
+"""The tasks of conf/task: what each consists of, a smoke test, and a picture of its reference."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+from omegaconf import DictConfig
+from rich.table import Table
+from torchrl.envs.utils import check_env_specs
+
+from hdmi.build import ConfigError, Task, make_env, make_task, scene_parts, set_threads
+from hdmi.envs.rendering import WorldRenderer
+from hdmi.evaluation.agents import BlindAgent, task_config, task_names
+from hdmi.evaluation.protocol import EvalResult, evaluate_policy
+from hdmi.evaluation.video import Moment, Overlay, picture, replay
+from hdmi.learning import Trainer
+from hdmi.motion import MotionError, find_motion, load_motion, make_playback
+from hdmi.motion.annotate import intervals
+from hdmi.motion.validate.checks import contact_positions
+
+_SPEC_ENVS, _EPISODES = 2, 16
+_DISTANCE = 3.2  # of the camera, m
+
+
+# -- what there is --------------------------------------------------------------------------------------------
+
+
+def sources(cfg: DictConfig, motion_root: str | None = None) -> dict[str, Path]:
+    """Folders of a task's motion: `shipped` with the package, and under `motion_root`."""
+    found = {}
+    for name, root in (("shipped", None), ("motion_root", motion_root)):
+        if name == "shipped" or root is not None:
+            try:
+                found[name] = find_motion(cfg.task.motion, root)
+            except MotionError:
+                continue
+    return found
+
+
+def list_tasks(motion_root: str | None = None) -> Table:
+    """All tasks: object, scenery, effectors, robot, and the motion that `motion_root` selects, as a table."""
+    table = Table(title="Tasks: python train.py task=NAME", title_justify="left")
+    for column in ("task", "object", "scenery", "effectors", "robot", "frames", "contact", "sources"):
+        table.add_column(column, justify="right" if column == "frames" else "left")
+    for name in task_names():
+        cfg = task_config(name, motion_root)
+        found = sources(cfg, motion_root)
+        path = found.get("shipped" if motion_root is None else "motion_root")
+        frames, contact = _motion_columns(path, [effector.body for effector in cfg.task.effectors])
+        scenery = ", ".join(item.name for item in cfg.task.scenery)
+        effectors = ", ".join(effector.body.removesuffix("_link") for effector in cfg.task.effectors)
+        table.add_row(name, _object(cfg), scenery, effectors, _robot(cfg), frames, contact, ", ".join(found))
+    return table
+
+
+def _motion_columns(path: Path | None, bodies: Sequence[str]) -> tuple[str, str]:
+    if path is None:
+        return "-", "-"
+    motion = load_motion(path)
+    labels = motion.object_contact
+    if labels is None or not bodies:
+        return str(motion.num_frames), "-"
+    columns = [" ".join(f"{a}-{b}" for a, b in intervals(column)) for column in labels.T]
+    if len(set(columns)) > 1:
+        columns = [f"{body.removesuffix('_link')} {text}" for body, text in zip(bodies, columns, strict=True)]
+    return str(motion.num_frames), ", ".join(dict.fromkeys(columns))
+
+
+def _object(cfg: DictConfig) -> str:
+    node = cfg.task.object
+    if node is None:
+        return "-"
+    hinge = node.get("hinge")
+    count = len(node.get("geoms") or ()) + (0 if hinge is None else len(hinge.geoms))
+    kind = "rigid" if hinge is None else "articulated"
+    fixed = ", fixed base" if node.get("fixed_base") else ""
+    return f"{node.name}: {kind}{fixed}, {count} geom{'s' if count > 1 else ''}, {node.get('mass', 1.0):g} kg"
+
+
+def _robot(cfg: DictConfig) -> str:
+    robot = cfg.robot
+    parts = [f"{robot.feet} feet, {robot.effector} hands"]
+    parts += [f"kp {value:g} {pattern}" for pattern, value in robot.stiffness.items()]
+    parts += ["self-collisions"] * bool(robot.self_collisions)
+    return ", ".join(parts)
+
+
+# -- does it hold together ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Contact:
+    """How the reference meets the object where its labels say, for one end effector.
+
+    Args:
+        effector: body of the robot.
+        distance: from its point to the contact point, in each labelled frame, m. [F]
+        gap: between its collision shapes and the object's, in each labelled frame, m; negative inside, at most
+            `hdmi.motion.playback.FAR`. [F]
+    """
+
+    effector: str
+    distance: np.ndarray
+    gap: np.ndarray
+
+
+def measure_contacts(cfg: DictConfig) -> list[Contact]:
+    """Replays the reference of a config without physics and measures every labelled contact of its effectors.
+
+    Raises:
+        ConfigError, MotionError: for a node or a motion that cannot be used.
+    """
+    motion = load_motion(find_motion(cfg.task.motion, cfg.motion_root))
+    playback = make_playback(motion, **scene_parts(cfg))
+    effectors, object_geoms = playback.scene.effectors, playback.scene.object_geoms
+    if not effectors:
+        return []
+    label = playback.reference.contact.numpy()
+    point, target = contact_positions(playback)
+    distance = np.linalg.norm(point - target, axis=-1)  # [T, E]
+    contacts = []
+    for e, effector in enumerate(effectors):
+        own = playback.robot_geoms[playback.on_bodies([effector.body])]
+        gap = playback.distances(own, object_geoms).min(axis=1)  # [T]
+        contacts.append(Contact(effector.body, distance[label[:, e], e], gap[label[:, e]]))
+    return contacts
+
+
+@dataclass
+class TaskCheck:
+    """What the smoke test of one task found; `problems` is empty if it passed."""
+
+    name: str
+    contacts: list[Contact] = field(default_factory=list)
+    zero: EvalResult | None = None  # servos that follow the reference
+    returns: list[float] = field(default_factory=list)  # mean reward of each training iteration
+    seconds: float = 0.0
+    problems: list[str] = field(default_factory=list)
+
+    @property
+    def learned(self) -> tuple[float, float]:
+        """Mean reward of the first and of the last quarter of the training iterations."""
+        quarter = max(len(self.returns) // 4, 1)
+        return float(np.mean(self.returns[:quarter])), float(np.mean(self.returns[-quarter:]))
+
+
+def check_task(
+    name: str, motion_root: str | None = None, frames: int = 65_536, num_envs: int = 512, num_threads: int = 0
+) -> TaskCheck:
+    """Smoke test of a task: its environment, its reference, no policy, and a short training.
+
+    1. The environment builds and passes TorchRL's spec check.
+    2. The reference, replayed without physics, meets the object where its labels say: end effectors are on average as
+       close to their contact points as the lost-contact termination asks for.
+    3. Servos that follow the reference give finite survival and errors.
+    4. A training of `frames` control steps earns more reward at its end than at its beginning; 0 skips it.
+
+    Raises:
+        ConfigError, MotionError: if the task or its motion does not exist or cannot be used.
+    """
+    start = time.perf_counter()
+    cfg = task_config(name, motion_root)
+    cfg.num_envs, cfg.total_frames, cfg.num_threads, cfg.logger.wandb = num_envs, frames, num_threads, None
+    set_threads(num_threads)
+    task = make_task(cfg)
+    check = TaskCheck(name)
+    try:
+        check_env_specs(make_env(cfg, _SPEC_ENVS, task))
+    except AssertionError as error:
+        check.problems.append(f"specs: {error}")
+    check.contacts = measure_contacts(cfg)
+    lost = (cfg.termination or {}).get("lost_contact")
+    limit = math.inf if lost is None else lost.distance
+    for contact in check.contacts:
+        if not len(contact.distance):
+            check.problems.append(f"{contact.effector}: the motion labels no contact")
+        elif (mean := contact.distance.mean()) > limit:
+            check.problems.append(
+                f"{contact.effector}: on average {mean:.2f} m from its contact point where labels say that it touches, "
+                f"and lost_contact allows {limit:g} m"
+            )
+    check.zero = evaluate_policy(BlindAgent("zero", cfg.action.history.size), cfg, _EPISODES, task)
+    bad = [key for key, value in check.zero.figures().items() if not math.isfinite(value["mean"])]
+    if bad or not check.zero.figures():
+        check.problems.append(f"no policy: {bad or 'no figures'} not finite")
+    if frames:
+        check.returns = _train(cfg)
+        first, last = check.learned
+        if not last > first:
+            check.problems.append(f"training: mean reward {first:.4f} at first, {last:.4f} at the end")
+    check.seconds = time.perf_counter() - start
+    return check
+
+
+def _train(cfg: DictConfig) -> list[float]:
+    """Mean reward of each iteration of a training that leaves nothing behind."""
+    with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()):
+        Trainer(cfg, Path(folder)).run()
+        with (Path(folder) / "metrics.csv").open(encoding="utf-8", newline="") as file:
+            return [float(row["reward"]) for row in csv.DictReader(file)]
+
+
+def check_table(checks: Sequence[TaskCheck]) -> Table:
+    """The figures of several checks, a row for each task."""
+    title = f"Tasks: {sum(not check.problems for check in checks)} of {len(checks)} pass"
+    table = Table(title=title, title_justify="left")
+    columns = ("task", "contact distance m", "surface gap m", "no policy: survives", "joints rad", "bodies m", "object")
+    for column in (*columns, "reward", "s", "problems"):
+        table.add_column(column, overflow="fold")
+    for check in checks:
+        distance = " ".join(f"{c.distance.mean():.3f}" if len(c.distance) else "-" for c in check.contacts)
+        gap = " ".join(f"{np.median(c.gap):.3f}" if len(c.gap) else "-" for c in check.contacts)
+        figures = {} if check.zero is None else check.zero.figures()
+
+        def shown(key: str, unit: str = "", figures: dict[str, dict[str, float]] = figures) -> str:
+            return f"{figures[key]['mean']:.3f}{unit}" if key in figures else ""
+
+        object_error = shown("object_joint_error", " rad") or shown("object_pos_error", " m")
+        reward = " to ".join(f"{value:.4f}" for value in check.learned) if check.returns else ""
+        table.add_row(
+            check.name, distance, gap, shown("survival"), shown("joint_error"), shown("body_error"), object_error,
+            reward, f"{check.seconds:.0f}", "\n".join(check.problems) or "none",
+        )  # fmt: skip
+    return table
+
+
+# -- what it looks like ---------------------------------------------------------------------------------------
+
+
+def picture_frame(task: Task) -> int:
+    """The middle of the longest labelled contact; of the motion, if there is none."""
+    contact = task.reference.contact.numpy()
+    runs = [run for column in contact.T for run in intervals(column)]
+    first, last = max(runs, key=lambda run: run[1] - run[0], default=(0, task.reference.num_frames - 1))
+    return (first + last) // 2
+
+
+def _clearest_azimuth(renderer: WorldRenderer, moment: Moment, task: Task) -> float:
+    """Of twelve directions around the robot the one in which the least of what matters is hidden."""
+    model, data = moment.model, moment.data
+    robot, effectors = model.body("pelvis").id, [model.body(effector.body).id for effector in task.scene.effectors]
+    parts = [
+        np.flatnonzero(model.body_rootid[model.geom_bodyid] == robot),
+        task.scene.object_geoms,
+        np.flatnonzero(np.isin(model.geom_bodyid, effectors)),
+    ]
+    forward = data.body("pelvis").xmat.reshape(3, 3)[:2, 0]
+    heading = math.degrees(math.atan2(forward[1], forward[0]))
+
+    def clarity(azimuth: float) -> float:
+        renderer.turn(azimuth)
+        pixels = renderer.visible(model, data)
+        return math.prod(int(pixels[part].sum()) + 1 for part in parts if len(part))
+
+    return max((heading + turn for turn in range(10, 370, 30)), key=clarity)
+
+
+def render_reference(task: Task, path: str | Path, size: tuple[int, int] = (360, 480)) -> Path:
+    """A picture of the reference at mid-contact, from where robot, object and end effectors are seen best.
+
+    Raises:
+        RuntimeError: without OpenGL; says what to install.
+        ConfigError: for a format that pictures cannot have.
+    """
+    path = Path(path)
+    if path.suffix not in (".jpg", ".png"):
+        raise ConfigError(f"{path}: expected a .jpg or .png file")
+    frame = picture_frame(task)
+    moment: Moment = next(replay(task, frame))
+    renderer = WorldRenderer(moment.model, *size, distance=_DISTANCE)
+    try:
+        renderer.turn(_clearest_azimuth(renderer, moment, task))
+        image = picture(renderer, moment, Overlay(task, ghost=False), size)
+    finally:
+        renderer.close()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    imageio.imwrite(path, image)
+    return path

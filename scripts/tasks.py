@@ -1,0 +1,118 @@
+"""Lists the tasks, checks them, or renders a picture of each.
+
+    python scripts/tasks.py [motion_root=FOLDER]
+    python scripts/tasks.py check [NAME ...] [frames=65536] [num_envs=512] [jobs=2] [motion_root=FOLDER]
+    python scripts/tasks.py gallery [NAME ...] [out=docs/images/tasks] [motion_root=FOLDER]
+
+References are those that ship with the package, or those under `motion_root`. `check` builds each task, replays its
+reference to see whether end effectors meet the object where labels say, follows it without a policy and trains for
+`frames` control steps (0: does not), `jobs` tasks at a time on one processor each. Its exit status is 1 if a task
+fails. Without names it checks all tasks, with `motion_root` those that have a motion there. `gallery` renders each
+reference at mid-contact.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import sys
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from hdmi.build import ConfigError, make_task
+from hdmi.cli import USER_ERRORS
+from hdmi.evaluation.agents import task_config, task_names
+from hdmi.evaluation.options import parse_options
+from hdmi.evaluation.tasks import TaskCheck, check_table, check_task, list_tasks, render_reference, sources
+from hdmi.motion import MotionError
+
+
+@dataclass
+class Options:
+    """See the module."""
+
+    motion_root: str | None = None
+    frames: int = 65_536
+    num_envs: int = 512
+    jobs: int = 2
+    out: str = "docs/images/tasks"
+
+
+def chosen(names: list[str], motion_root: str | None) -> list[str]:
+    """The named tasks; without names all of them, or those with a motion under `motion_root`."""
+    if names or motion_root is None:
+        return names or task_names()
+    return [name for name in task_names() if "motion_root" in sources(task_config(name), motion_root)]
+
+
+def check(names: list[str], options: Options, console: Console) -> int:
+    """Checks tasks; those whose motion cannot be used fail, too."""
+    names = chosen(names, options.motion_root)
+    if not names:
+        raise ConfigError(f"motion_root: no task has its motion under {options.motion_root}")
+    checks: dict[str, TaskCheck] = {}
+    spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
+    with ProcessPoolExecutor(min(options.jobs, len(names)), spawn, initializer=_quiet) as pool:
+        options_of = (options.motion_root, options.frames, options.num_envs, 1)
+        futures = {pool.submit(check_task, name, *options_of): name for name in names}
+        for future in as_completed(futures):
+            name = futures[future]
+            try:
+                checks[name] = future.result()
+            except MotionError as error:
+                checks[name] = TaskCheck(name, problems=[str(error)])
+            verdict = "failed" if checks[name].problems else "passed"
+            console.print(f"{len(checks)}/{len(names)} {name} {verdict}, {checks[name].seconds:.0f} s", highlight=False)
+    console.print(check_table([checks[name] for name in names]))
+    return int(any(check.problems for check in checks.values()))
+
+
+def _quiet() -> None:
+    """In a worker: TorchRL's reports of specs that are right."""
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+
+
+def gallery(names: list[str], options: Options, console: Console) -> int:
+    """Renders pictures of tasks."""
+    for name in chosen(names, options.motion_root):
+        try:
+            task = make_task(task_config(name, options.motion_root))
+        except MotionError as error:
+            if names:
+                raise
+            console.print(f"{name}: {error}", soft_wrap=True)
+            continue
+        console.print(str(render_reference(task, Path(options.out) / f"{name}.jpg")), soft_wrap=True)
+    return 0
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the script; returns its exit status."""
+    if arguments in (["-h"], ["--help"]):
+        print(__doc__)
+        return 0
+    # tables keep their columns in log files
+    console = Console() if sys.stdout.isatty() else Console(width=200)
+    try:
+        words = [argument for argument in arguments if "=" not in argument]
+        options = parse_options(Options, [argument for argument in arguments if "=" in argument])
+        for key in ("num_envs", "jobs"):
+            if getattr(options, key) < 1:
+                raise ConfigError(f"{key}: expected at least 1, got {getattr(options, key)}")
+        if not words:
+            console.print(list_tasks(options.motion_root))
+            return 0
+        commands = {"check": check, "gallery": gallery}
+        if words[0] not in commands:
+            raise ConfigError(f"there is no command {words[0]!r}; there is {', '.join(commands)}")
+        return commands[words[0]](words[1:], options, console)
+    except (*USER_ERRORS, RuntimeError, OSError) as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

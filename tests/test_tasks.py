@@ -1,0 +1,344 @@
+"""The tasks of conf/task: they build and step, objects move as they should, and the smoke test finds what is wrong."""
+
+from __future__ import annotations
+
+import math
+import runpy
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import imageio.v2 as imageio
+import mujoco
+import numpy as np
+import pytest
+import torch
+import trimesh
+from mocks import CONF, load_config
+from omegaconf import DictConfig, OmegaConf
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from hdmi.assets import default_joint_pos, g1
+from hdmi.build import ConfigError, Task, make_env, make_task, make_transforms
+from hdmi.evaluation.agents import task_names
+from hdmi.evaluation.tasks import check_task, list_tasks, measure_contacts, picture_frame, render_reference
+from hdmi.motion import Motion, forward_kinematics, save_motion
+
+ROOT = CONF.parent
+TASKS = task_names()
+PAPER = {
+    "move_suitcase", "push_box", "carry_bread_box", "move_foam", "push_door_hand", "open_door_feet", "traverse_door",
+    "open_foldchair_sit", "topple_wood_board", "roll_ball", "move_stool", "lift_box_over_shoulder", "truman_bow",
+    "move_trash_bin",
+}  # fmt: skip
+ARTICULATED = {"push_door_hand", "open_door_feet", "traverse_door", "open_foldchair_sit"}
+
+# m, mean distance of end effector points to contact points in the labelled frames of the public motions
+PUBLIC_DISTANCES = {
+    "move_suitcase": 0.11, "push_box": 0.06, "carry_bread_box": 0.045, "move_foam": 0.03, "push_door_hand": 0.19,
+    "open_door_feet": 0.19, "open_foldchair_sit": 0.13, "topple_wood_board": 0.16,
+}  # fmt: skip
+
+FRAMES = 40
+HINGE_ANGLE = 0.5  # of the standing motion's objects, rad
+
+
+def standing_motion(cfg: DictConfig) -> Motion:
+    """The robot stands before the task's object; nothing moves, contact is intended in the second half."""
+    node = cfg.task.object
+    bodies, joints, values = ["pelvis"], ["left_knee_joint"], [0.669]
+    places = [[0.0, 0.0, g1.ROOT_HEIGHT]]
+    for item in [*([] if node is None else [node]), *cfg.task.scenery]:
+        bodies.append(item.name)
+        places.append([1.2, 0.0, 0.5] if len(bodies) == 2 else [4.0 + len(bodies), 0.0, 0.1])
+    if node is not None and node.get("hinge") is not None:
+        joints.append(node.hinge.name)
+        values.append(HINGE_ANGLE)
+    pos = np.tile(np.asarray(places, np.float32), (FRAMES, 1, 1))
+    quat = np.tile(np.float32([1, 0, 0, 0]), (FRAMES, len(bodies), 1))
+    contact = np.zeros((FRAMES, len(cfg.task.effectors)), bool)
+    contact[FRAMES // 2 :] = True
+    zeros = np.zeros_like(pos)
+    joint_pos = np.tile(np.float32(values), (FRAMES, 1))
+    return Motion(
+        name=cfg.task.motion, fps=50.0, body_names=tuple(bodies), joint_names=tuple(joints), body_pos_w=pos,
+        body_quat_w=quat, body_lin_vel_w=zeros, body_ang_vel_w=zeros, joint_pos=joint_pos,
+        joint_vel=np.zeros_like(joint_pos), object_contact=contact if contact.size else None,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def motions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A motion for every task."""
+    folder = tmp_path_factory.mktemp("motions")
+    for name in TASKS:
+        save_motion(standing_motion(load_config(f"task={name}")), folder / name)
+    return folder
+
+
+@cache
+def built(name: str, motions: Path) -> tuple[DictConfig, Task]:
+    cfg = load_config(f"task={name}", f"motion_root={motions}")
+    return cfg, make_task(cfg)
+
+
+def env_of(name: str, motions: Path, num_envs: int = 2, *overrides: str) -> TransformedEnv:
+    cfg, task = built(name, motions)
+    if overrides:
+        cfg = load_config(f"task={name}", f"motion_root={motions}", *overrides)
+    return make_env(cfg, num_envs, task)
+
+
+class TestConfigs:
+    def test_the_papers_fourteen_are_there(self):
+        assert set(TASKS) >= PAPER | {"walk", "lift_box"}
+
+    @pytest.mark.parametrize("name", TASKS)
+    def test_builds(self, name, motions):
+        nodes = [node for node, _ in make_transforms(*built(name, motions))]
+        assert ("reward.object_joint" in nodes) == (name in ARTICULATED)
+        for node in ("reward.object_pose", "termination.object_pose"):
+            assert (node in nodes) == (name not in ARTICULATED | {"walk"})
+
+    @pytest.mark.parametrize("name", ["traverse_door", "truman_bow"])
+    def test_passes_the_specs(self, name, motions):
+        env = env_of(name, motions)
+        check_env_specs(env)
+        rollout = env.rollout(3, break_when_any_done=False)
+        assert rollout["next", "policy"].isfinite().all()
+        assert rollout["next", "reward"].isfinite().all()
+
+    def test_hyper_parameters_are_the_same(self, motions):
+        algos = [built(name, motions)[0].algo for name in sorted(PAPER | {"walk"})]
+        assert all(algo == algos[0] for algo in algos)
+
+    def test_the_command_line_chooses_the_algorithm(self):
+        algo = load_config("task=push_box", "algo=ppo_paper").algo
+        assert (algo.desired_kl, algo.epochs, algo.init_noise) == (0.01, 3, 1.0)
+
+    def test_another_object_for_a_task(self):
+        assert load_config("task=push_door_hand", "object=suitcase").task.object.name == "suitcase"
+
+
+class TestDoor:
+    """At angle zero the panel closes the opening between the walls; beyond a quarter turn it leaves it."""
+
+    def panel(self, motions: Path, angle: float) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner of the panel in the frame of the door."""
+        _, task = built("traverse_door", motions)
+        scene, data = task.scene, mujoco.MjData(task.scene.model)
+        data.qpos[scene.object_hinge_qpos] = angle
+        mujoco.mj_kinematics(scene.model, data)
+        geom = scene.object_geoms[-1]
+        corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T * scene.model.geom_size[geom]
+        world = corners @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+        local = world - data.xpos[scene.object_body]
+        return local.min(0), local.max(0)
+
+    def test_closed(self, motions):
+        low, high = self.panel(motions, 0.0)
+        np.testing.assert_allclose(low, [-0.02, -0.5, 0.025], atol=1e-6)
+        np.testing.assert_allclose(high, [0.02, 0.5, 1.975], atol=1e-6)
+
+    @pytest.mark.parametrize("side", [-1.0, 1.0])
+    def test_open(self, motions, side):
+        low, high = self.panel(motions, side * math.pi / 2)
+        assert low[1] > 0.45
+        # the hinge is at +y, the panel extends to -y: a positive turn moves it to +x
+        assert (high if side > 0 else low)[0] == pytest.approx(side, abs=1e-6)
+
+    def test_stands_still_and_weighs_what_its_panel_does(self, motions):
+        env = env_of("traverse_door", motions, 3, "reset.state.start=first")
+        td = env.base_env.reset()
+        base, link = env.base_env.scene.object_body, env.base_env.scene.object_link
+        mass = env.base_env.backend.model("body_mass")
+        assert (mass[:, base] == 0).all()
+        torch.testing.assert_close(td["object", "mass"].squeeze(-1), mass[:, link].float())
+        env.reset()
+        drawn = env.base_env.backend.model("body_mass")[:, link]
+        assert ((drawn >= 5) & (drawn <= 20)).all()
+        assert len(drawn.unique()) == 3
+
+    def test_joint_friction_and_damping_are_drawn(self, motions):
+        env = env_of("open_door_feet", motions, 4)
+        env.reset()
+        dof = env.base_env.scene.object_hinge_dof
+        friction = env.base_env.backend.model("dof_frictionloss")[:, dof]
+        damping = env.base_env.backend.model("dof_damping")[:, dof]
+        assert ((friction >= 5) & (friction <= 10)).all()
+        assert ((damping >= 1) & (damping <= 5)).all()
+        assert len(friction.unique()) == len(damping.unique()) == 4
+
+    def test_reward_is_for_the_angle(self, motions):
+        still = ["+ablation=no_randomization", "reset.state.noise=null", "reset.state.start=first"]
+        env = env_of("push_door_hand", motions, 2, *still)
+        td = env.reset()
+        scene = env.base_env.scene
+        # held at 0.3 rad off the reference: the reward is exp(-0.3 / 0.5)
+        env.base_env.backend.data("qpos")[:, scene.object_hinge_qpos] = HINGE_ANGLE + 0.3
+        env.base_env.backend.refresh(torch.arange(2))
+        after = env.step(td.set("action", torch.zeros(env.action_spec.shape)))["next"]
+        term = after["reward_terms", "object_joint"]
+        torch.testing.assert_close(term, torch.full_like(term, math.exp(-0.6)), atol=0.01, rtol=0)
+
+    def test_scaled_with_its_hinge_and_contact_points(self, motions):
+        env = env_of("push_door_hand", motions, 2, "randomization.object_scale.scale=[0.8,0.8]")
+        env.reset()
+        base = env.base_env
+        place = base.backend.data("xpos")
+        hinge = place[:, base.scene.object_link] - place[:, base.scene.object_body]
+        torch.testing.assert_close(hinge, torch.tensor([[0.0, 0.4, 0.0]] * 2, dtype=torch.float64))
+        size = base.backend.model("geom_size")[:, int(base.scene.object_geoms[-1])]
+        torch.testing.assert_close(size, torch.tensor([[0.016, 0.4, 0.78]] * 2, dtype=torch.float64))
+
+
+def test_folding_chair_has_its_seat_up_at_zero_and_level_when_open(motions):
+    _, task = built("open_foldchair_sit", motions)
+    scene, data = task.scene, mujoco.MjData(task.scene.model)
+    ahead = []
+    for angle in (0.0, 1.57):
+        data.qpos[scene.object_hinge_qpos] = angle
+        mujoco.mj_kinematics(scene.model, data)
+        ahead.append(data.xmat[scene.object_link].reshape(3, 3)[:, 0].copy())
+    assert ahead[0][2] > 0.99
+    assert ahead[1][0] > 0.99
+
+
+def test_stairs_rise_in_three_steps(motions):
+    _, task = built("truman_bow", motions)
+    scene = task.scene
+    tops = scene.model.geom_pos[scene.object_geoms, 2] + scene.model.geom_size[scene.object_geoms, 2]
+    np.testing.assert_allclose(tops, [0.21, 0.41, 0.61])
+    assert scene.model.geom("left_foot_collision").conaffinity[0] & 1  # feet meet other parts of the robot
+
+
+def test_servos_of_the_wrists_are_soft_where_the_task_says_so(motions):
+    soft, table = (built(name, motions)[1].scene.model for name in ("carry_bread_box", "move_stool"))
+    for joint in g1.JOINT_NAMES:
+        gains = [float(model.actuator(joint).gainprm[0]) for model in (soft, table)]
+        assert (gains[0] == 4.0) == ("wrist" in joint), joint
+        assert (gains[0] == gains[1]) == ("wrist" not in joint), joint
+
+
+class TestCheck:
+    def test_distances_by_hand(self, tmp_path):
+        """A box whose contact point is the left hand's, seen from a centimetre to the side."""
+        cfg = load_config("task=lift_box", "task.scenery=[]", f"motion_root={tmp_path}")
+        point = np.array(cfg.task.effectors[0].point)
+        pos, quat = forward_kinematics(
+            np.array([[0, 0, g1.ROOT_HEIGHT]]), np.array([[1.0, 0, 0, 0]]), default_joint_pos()[None]
+        )
+        hand = g1.BODY_NAMES.index("left_wrist_yaw_link")
+        turned = np.zeros(3)
+        mujoco.mju_rotVecQuat(turned, point, quat[0, hand])
+        motion = standing_motion(cfg)
+        # the target is at +y of the box: its side is then one centimetre from the fingertip
+        box = pos[0, hand] + turned - np.array(cfg.task.effectors[0].target) + [0.0, -0.01, 0.0]
+        motion.body_pos_w[:, 1] = box
+        save_motion(motion, tmp_path / "lift_box")
+        left, right = measure_contacts(cfg)
+        np.testing.assert_allclose(left.distance, 0.01, atol=1e-4)
+        assert len(left.distance) == FRAMES // 2
+        assert np.abs(left.gap).max() < 0.05
+        assert right.distance.min() > 0.05
+
+    def test_hands_of_lift_box_press_its_box(self):
+        for contact in measure_contacts(load_config()):
+            assert contact.distance.mean() < 0.03
+            assert contact.gap.mean() < 0.0
+
+    def test_finds_an_object_out_of_reach_and_missing_labels(self, tmp_path):
+        motion = standing_motion(load_config("task=push_box"))
+        motion.object_contact[:, 1] = False
+        save_motion(motion, tmp_path / "push_box")
+        check = check_task("push_box", str(tmp_path), frames=0)
+        far, unlabelled = check.problems
+        assert far.startswith("left_wrist_yaw_link: on average ")
+        assert unlabelled == "right_wrist_yaw_link: the motion labels no contact"
+        assert 0 < check.zero["survival"]["mean"] <= 1
+
+    def test_list_has_all_tasks(self, motions):
+        table = list_tasks(str(motions))
+        assert list(table.columns[0].cells) == TASKS
+        columns = {column.header: dict(zip(TASKS, column.cells, strict=True)) for column in table.columns}
+        assert columns["frames"]["push_box"] == str(FRAMES)
+        assert columns["contact"]["push_box"] == f"{FRAMES // 2}-{FRAMES - 1}"
+        assert columns["robot"]["push_box"] == "sphere feet, L hands"
+        assert columns["object"]["traverse_door"] == "door: articulated, fixed base, 3 geoms, 20 kg"
+        assert columns["sources"]["lift_box"] == "shipped, motion_root"
+
+    COMMAND = (sys.executable, str(ROOT / "scripts" / "tasks.py"))
+
+    def test_script(self):
+        options = ["check", "lift_box", "frames=256", "num_envs=16", "jobs=1"]
+        result = subprocess.run([*self.COMMAND, *options], capture_output=True, text=True, timeout=300)
+        # so short a training may or may not improve; everything else must pass
+        assert result.returncode in (0, 1), result.stderr
+        assert "1/1 lift_box" in result.stdout
+        assert "labels" not in result.stdout
+        assert "specs" not in result.stdout
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["chekc"], "no command 'chekc'"),
+            (["gallery", "lift_bax"], "no 'lift_bax'"),
+            (["check", "jobs=0"], "jobs: expected at least 1"),
+            (["check", "job=1"], "unknown option 'job'"),
+        ],
+    )
+    def test_script_says_what_it_does_not_know(self, arguments, message, capsys):
+        assert runpy.run_path(self.COMMAND[1])["main"](arguments) == 2
+        assert message in capsys.readouterr().err
+
+
+class TestPublicMotions:
+    @pytest.mark.parametrize("name", sorted(PUBLIC_DISTANCES))
+    def test_end_effectors_are_where_they_were_measured(self, name, public_motions):
+        contacts = measure_contacts(load_config(f"task={name}", f"motion_root={public_motions}"))
+        mean = np.concatenate([contact.distance for contact in contacts]).mean()
+        assert mean == pytest.approx(PUBLIC_DISTANCES[name], abs=0.01)
+
+
+def test_picture_is_taken_at_mid_contact(motions, tmp_path):
+    _, task = built("move_stool", motions)
+    assert picture_frame(task) == (FRAMES // 2 + FRAMES - 1) // 2
+    assert picture_frame(built("walk", motions)[1]) == (FRAMES - 1) // 2
+    try:
+        path = render_reference(task, tmp_path / "stool.jpg", (120, 160))
+    except RuntimeError as error:
+        pytest.skip(str(error))
+    image = imageio.imread(path)
+    assert image.shape == (120, 160, 3)
+    assert image.std() > 10
+
+
+class TestFifteenth:
+    """The example of docs/tasks.md, as it stands there, with a mesh and a motion."""
+
+    def config(self, tmp_path: Path) -> DictConfig:
+        text = (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8")
+        block = text.split("```yaml\n# conf/task/carry_vase.yaml\n")[1].split("```")[0]
+        mesh = tmp_path / "vase.obj"
+        trimesh.creation.capsule(height=20.0, radius=8.0).export(mesh)
+        assert "/path/to/vase.obj" in block
+        (tmp_path / "task").mkdir()
+        (tmp_path / "task" / "carry_vase.yaml").write_text(block.replace("/path/to/vase.obj", str(mesh)))
+        cfg = load_config(f"hydra.searchpath=[file://{tmp_path}]", "task=carry_vase", f"motion_root={tmp_path}")
+        save_motion(standing_motion(cfg), tmp_path / "carry_vase")
+        return cfg
+
+    def test_steps(self, tmp_path):
+        cfg = self.config(tmp_path)
+        env = make_env(cfg, 2)
+        assert env.rollout(3, break_when_any_done=False)["next", "policy"].isfinite().all()
+        geoms = env.base_env.scene.object_geoms
+        assert (env.base_env.scene.model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_MESH).all()
+
+    def test_its_mesh_cannot_be_scaled_per_world(self, tmp_path):
+        cfg = self.config(tmp_path)
+        cfg.randomization.object_scale = OmegaConf.create({"_target_": "hdmi.transforms.ObjectScale", "scale": [1, 2]})
+        with pytest.raises(ConfigError, match=r"randomization\.object_scale.*mesh"):
+            make_env(cfg, 2)
