@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mocks import load_script
 from scipy.spatial.transform import Rotation
 
-from hdmi.assets import GeomConfig, HingeConfig, ObjectConfig
+from hdmi.assets import Effector, GeomConfig, HingeConfig, ObjectConfig
 from hdmi.build import scene_parts
 from hdmi.evaluation.agents import task_config
 from hdmi.motion import Motion, MotionError, find_motion, load_motion, save_motion
@@ -297,6 +297,12 @@ class TestContacts:
         bare = replace(alone, object_contact=None)
         with pytest.raises(MotionError, match="needs contacts"):
             complete_object(bare, object=scene["object"], effectors=scene["effectors"], overrides=overrides)
+
+    def test_effectors_that_cannot_touch(self, lift_box):
+        motion, scene = lift_box
+        effectors = [Effector("left_wrist_roll_link")]
+        with pytest.raises(MotionError, match="'left_wrist_roll_link' has no collision shape"):
+            annotate_motion(motion, **{**scene, "effectors": effectors})
 
     def test_no_keyframes_and_no_object(self, lift_box):
         motion, scene = lift_box

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import ModuleType
 
 import mujoco
@@ -105,6 +106,13 @@ class TestRobot:
         levitating = validate_motion(moved(z=within(10, 59, 0.2)))["floating"]
         assert levitating.verdict == "bad"
 
+    def test_the_shortest_motions(self):
+        motion = moved()
+        arrays = ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w", "joint_pos", "joint_vel")
+        for count in (2, 3, 4):
+            short = replace(motion, **{key: getattr(motion, key)[:count] for key in arrays})
+            assert validate_motion(short).verdict == "good"
+
     def test_ground_penetration(self):
         finding = validate_motion(moved(z=within(20, 39, -0.03)))["ground_penetration"]
         assert (finding.verdict, spans(finding)) == ("usable", [(20, 39)])
@@ -141,6 +149,19 @@ class TestRobot:
         assert (report["joint_limit"].verdict, spans(report["joint_limit"])) == ("bad", [(20, 29)])
         assert report["joint_velocity"].value == pytest.approx(0.9 * FPS / 2 / 20, rel=1e-3)
         assert report["joint_velocity"].faults[0].part == "left_knee_joint"
+
+    def test_missing_joints(self):
+        motion = moved()
+        kept = [i for i, name in enumerate(g1.JOINT_NAMES) if "elbow" not in name and "shoulder" not in name]
+        arms_missing = replace(
+            motion,
+            joint_names=tuple(g1.JOINT_NAMES[i] for i in kept),
+            joint_pos=motion.joint_pos[:, kept],
+            joint_vel=motion.joint_vel[:, kept],
+        )
+        report = validate_motion(arms_missing)
+        assert (report["missing_joints"].value, report["missing_joints"].verdict) == (8, "usable")
+        assert "left_elbow_joint" in report.notes[0]
 
     def test_bodies_beside_the_joints(self):
         motion = moved()
@@ -290,6 +311,13 @@ class TestObject:
     def test_undescribed_bodies_are_noted(self, lift_box):
         motion, _ = lift_box
         assert any("box, stand" in note for note in validate_motion(motion).notes)
+
+
+def test_documented_limits_are_the_limits():
+    text = (Path(__file__).parents[1] / "docs" / "motions.md").read_text(encoding="utf-8")
+    for check, limit in LIMITS.items():
+        bad = f"{limit.bad:g}" if np.isfinite(limit.bad) else "-"
+        assert f"| `{check}` | {limit.good:g} | {bad} | {limit.unit} | {limit.share:g} | {limit.about} |" in text
 
 
 class TestJudge:

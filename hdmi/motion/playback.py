@@ -101,6 +101,11 @@ class Playback:
         """Distances of the robot's geoms from the object, see `distances`. [T, R]"""
         return self.distances(self.robot_geoms, self.scene.object_geoms)
 
+    @cached_property
+    def object_clearance(self) -> np.ndarray:
+        """Distances of the object's geoms from the ground, see `distances`. [T, O]"""
+        return self.distances(self.scene.object_geoms, self.ground_geoms)
+
     def distances(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """Signed distances between geoms (meshes as their convex hulls), negative inside, at most `FAR`, m.
 

@@ -4,7 +4,14 @@ annotated = annotate_motion(motion, object=box, effectors=hands, overrides=load_
 """
 
 from hdmi.motion.annotate.annotate import Agreement, agreement, annotate_motion, complete_object
-from hdmi.motion.annotate.contacts import ContactCriteria, Contacts, contact_points, find_contacts, intervals
+from hdmi.motion.annotate.contacts import (
+    ContactCriteria,
+    Contacts,
+    contact_points,
+    find_contacts,
+    intervals,
+    label_contacts,
+)
 from hdmi.motion.annotate.overrides import FILE, Interval, Overrides, load_overrides
 from hdmi.motion.annotate.surface import Surface, object_surfaces
 from hdmi.motion.annotate.trajectory import complete_hinge, complete_trajectory
@@ -25,6 +32,7 @@ __all__ = [
     "contact_points",
     "find_contacts",
     "intervals",
+    "label_contacts",
     "load_overrides",
     "object_surfaces",
 ]

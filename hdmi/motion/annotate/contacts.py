@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hdmi.assets import ObjectConfig
 from hdmi.motion.annotate.surface import Surface, object_surfaces
+from hdmi.motion.check import MotionError
 from hdmi.motion.kinematics import derivative
 from hdmi.motion.playback import Playback
 
@@ -63,20 +64,29 @@ def find_contacts(playback: Playback, config: ObjectConfig, criteria: ContactCri
     moves do not interact with it. The contact point of an interval is the point of the surface nearest to the
     effector's, in the median.
     """
-    criteria = criteria or ContactCriteria()
     surfaces = object_surfaces(config)
     gap = np.stack([_gap(playback, effector.body, surfaces) for effector in playback.scene.effectors], axis=1)
+    label, _ = label_contacts(playback, gap, criteria)
+    return Contacts(label, contact_points(playback, config, label), gap)
+
+
+def label_contacts(
+    playback: Playback, gap: np.ndarray, criteria: ContactCriteria | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Labels as `find_contacts` does, from given distances between the surfaces, m. [T, E]
+
+    Returns:
+        Labels, bool [T, E], and the speed of the object's material point that is where the effector is, m/s. [T, E]
+    """
+    criteria = criteria or ContactCriteria()
     local = effector_points(playback)
-    link_pos, link_mat = playback.body_poses(config.link)
+    link_pos, link_mat = playback.body_poses(playback.scene.object_link)
     fps = playback.fps
     relative = np.linalg.norm(derivative(local, fps), axis=-1)  # [T, E]
-    # of the object's material point that is where the effector is
     turning = np.einsum("tij,tej->tei", derivative(link_mat, fps), local)
     speed = np.linalg.norm(derivative(link_pos, fps)[:, None] + turning, axis=-1)
-    label = np.stack(
-        [_label(gap[:, i], speed[:, i], relative[:, i], fps, criteria) for i in range(gap.shape[1])], axis=1
-    )
-    return Contacts(label, contact_points(playback, config, label), gap)
+    columns = [_label(gap[:, i], speed[:, i], relative[:, i], fps, criteria) for i in range(gap.shape[1])]
+    return np.stack(columns, axis=1), speed
 
 
 def contact_points(playback: Playback, config: ObjectConfig, label: np.ndarray) -> np.ndarray:
@@ -130,7 +140,10 @@ def _shape_points(playback: Playback, body: str) -> tuple[np.ndarray, np.ndarray
     """Points in a robot body's collision shapes, in its frame, and how far the surface is from each. [P, 3], [P]"""
     model = playback.scene.model
     points, radii = [], []
-    for geom in playback.robot_geoms[playback.on_bodies([body])]:
+    geoms = playback.robot_geoms[playback.on_bodies([body])]
+    if not geoms.size:
+        raise MotionError(f"contacts: the robot's {body!r} has no collision shape that could touch the object")
+    for geom in geoms:
         size, kind = model.geom_size[geom], model.geom_type[geom]
         if kind == mujoco.mjtGeom.mjGEOM_BOX:
             grid = np.linspace(-1, 1, _FACE_POINTS)

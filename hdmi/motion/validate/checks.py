@@ -9,27 +9,30 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
 from hdmi.assets import g1
+from hdmi.motion.annotate import label_contacts
 from hdmi.motion.kinematics import derivative, forward_kinematics
 from hdmi.motion.motion import Motion
-from hdmi.motion.playback import Playback
+from hdmi.motion.playback import FAR, Playback
 from hdmi.motion.validate.dynamics import TOUCH, Dynamics
 from hdmi.motion.validate.report import Series
 
-PLANTED = 0.01  # m; a foot's point this near the ground (or the height at which it stands) stands on it
+_PLANTED = 0.01  # m; a foot's point this near the ground (or the height at which it stands) stands on it
 _SWING = 0.7  # m/s
 _AT_REST = 0.05  # m/s
 _SETTLING = 2  # frames after landing and before taking off in which a foot may move
 
 
 def consistency(playback: Playback) -> dict[str, Series]:
-    """Bodies against forward kinematics, velocities against differences of positions."""
+    """Joints that are there, bodies against forward kinematics, velocities against differences of positions."""
     motion = playback.motion
     robot = [name for name in motion.body_names if name in g1.BODY_NAMES]
     rows, columns = [g1.BODY_NAMES.index(n) for n in robot], [motion.body_names.index(n) for n in robot]
     qpos = playback.qpos
     pos, quat = forward_kinematics(qpos[:, :3], qpos[:, 3:7], qpos[:, playback.scene.joint_qpos])
     along = np.abs((quat[:, rows] * motion.body_quat_w[:, columns]).sum(-1))
+    absent = sum(name not in motion.joint_names for name in g1.JOINT_NAMES)
     return {
+        "missing_joints": Series(np.full((playback.num_frames, 1), float(absent)), ["robot"]),
         "fk_position": Series(np.linalg.norm(pos[:, rows] - motion.body_pos_w[:, columns], axis=-1), robot),
         "fk_orientation": Series(2 * np.arccos(np.minimum(along, 1.0)), robot),
         "joint_velocity_error": Series(
@@ -105,14 +108,15 @@ def ground_gap(playback: Playback) -> float:
 def ground(playback: Playback, dynamics: Dynamics, gap: float) -> dict[str, Series]:
     """Standing: clearance, penetration, slide, and what inverse dynamics asks of the ground.
 
-    A robot may stand on the object, too, but not on its arms there: those hold it.
+    A robot may stand on an object, too, that stands itself, but not on its arms there: those hold it.
     """
     scene, names = playback.scene, [_geom_name(playback, g) for g in playback.robot_geoms]
     to_ground = playback.ground_distance
     on_arms = np.array([any(word in name for word in ("shoulder", "elbow", "wrist", "hand")) for name in names])
     clearance = to_ground
     if scene.object_geoms.size:
-        clearance = np.minimum(to_ground, np.where(on_arms, np.inf, playback.object_distance))
+        stands = (playback.object_clearance.min(axis=1) < TOUCH) | (scene.object_free_dof is None)
+        clearance = np.minimum(to_ground, np.where(stands[:, None] & ~on_arms, playback.object_distance, np.inf))
     floating = clearance.min(axis=1, keepdims=True).clip(min=0)
     floating[dynamics.in_flight] = np.nan
     return {
@@ -133,7 +137,7 @@ def _slide(playback: Playback, clearance: np.ndarray, gap: float) -> np.ndarray:
     of_foot = [playback.on_bodies([foot]) for foot in g1.FEET]
     pos = np.stack([data.geom_xpos[playback.robot_geoms] for data in playback.frames()])  # [T, R, 3]
     speed = np.linalg.norm(derivative(pos, playback.fps)[..., :2], axis=-1)
-    speed = np.where(clearance <= gap + PLANTED, speed, np.inf)
+    speed = np.where(clearance <= gap + _PLANTED, speed, np.inf)
     slide = np.stack([speed[:, geoms].min(axis=1, initial=np.inf) for geoms in of_foot], axis=1)
     swings = (slide > _SWING) & (slide[:, ::-1] < _SWING)
     planted = np.isfinite(slide) & ~swings
@@ -156,7 +160,7 @@ def objects(playback: Playback, dynamics: Dynamics) -> dict[str, Series]:
     if of_effectors.any():
         out["grip_depth"] = Series(depth[:, of_effectors], names[of_effectors])
     if scene.object_free_dof is not None:
-        clearance = playback.distances(scene.object_geoms, playback.ground_geoms)
+        clearance = playback.object_clearance
         geoms = [_geom_name(playback, g) for g in scene.object_geoms]
         out["object_in_ground"] = Series((-clearance).clip(min=0), geoms)
         floating = clearance.min(axis=1, keepdims=True).clip(min=0)
@@ -180,16 +184,15 @@ def labels(playback: Playback) -> dict[str, Series]:
         return {}
     label = reference.contact.numpy()  # [T, E]
     names = [effector.body for effector in scene.effectors]
-    surface = np.stack([playback.object_distance[:, playback.on_bodies([name])].min(axis=1) for name in names], axis=1)
+    gaps = [playback.object_distance[:, playback.on_bodies([name])].min(axis=1, initial=FAR) for name in names]
+    surface = np.stack(gaps, axis=1)  # [T, E]
     point, target = contact_positions(playback)
     apart = np.linalg.norm(point - target, axis=-1)
-    speed = np.linalg.norm(derivative(target, playback.fps), axis=-1)
-    relative = np.linalg.norm(derivative(point - target, playback.fps), axis=-1)
-    held = (surface < PLANTED) & (relative < 0.5 * speed)
+    found, speed = label_contacts(playback, surface)
     return {
         "contact_gap": Series(np.where(label, surface.clip(min=0), np.nan), names),
         "contact_point": Series(np.where(label, apart, np.nan), names),
-        "unlabelled_contact": Series(np.where(label, np.nan, np.where(held, speed, 0.0)), names),
+        "unlabelled_contact": Series(np.where(label, np.nan, np.where(found, speed, 0.0)), names),
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import mujoco
@@ -57,7 +58,7 @@ class _Solver:
     def __init__(self, playback: Playback, ground_gap: float):
         self.playback, self.ground_gap = playback, ground_gap
         scene = playback.scene
-        model = scene.model.__copy__()
+        model = copy(scene.model)
         model.geom_margin[:] = model.body_margin[:] = _REACH / 2  # margins of a pair add up
         model.dof_damping[:6] = model.dof_damping[scene.joint_dof] = 0.0  # of the servos
         self.model, self.data = model, mujoco.MjData(model)
@@ -111,9 +112,12 @@ class _Solver:
             return needed
         weight, target = self.row_weight.copy(), needed.copy()
         dofs, effort = self.playback.scene.joint_dof, np.array(g1.EFFORT_LIMITS)
-        held = np.zeros(len(dofs), bool)
+        held, left = np.zeros(len(dofs), bool), needed
         while True:
-            forces, _ = nnls(weight[:, None] * generators, weight * target, maxiter=1000)
+            try:
+                forces, _ = nnls(weight[:, None] * generators, weight * target, maxiter=1000)
+            except RuntimeError:  # cycles between degenerate solutions: explained no better than before
+                return left
             left = needed - generators @ forces
             torque = left[dofs]
             beyond = (np.abs(torque) > effort) & ~held
@@ -131,7 +135,7 @@ class _Solver:
         lin1, lin2, ang1, ang2 = np.zeros((4, 3, model.nv))
         for contact in data.contact:
             first, second = int(contact.geom[0]), int(contact.geom[1])
-            if contact.dist > self._reach(t, first, second):
+            if (self.robot[first] and self.robot[second]) or contact.dist > self._reach(t, first, second):
                 continue
             mujoco.mj_jac(model, data, lin1, ang1, contact.pos, model.geom_bodyid[first])
             mujoco.mj_jac(model, data, lin2, ang2, contact.pos, model.geom_bodyid[second])

@@ -25,10 +25,11 @@ class Limit:
     share: float = 0.0
 
 
-# `good` is what can be asked of a clean reference; `bad` lies beyond the worst of the public HDMI motions, all of which
-# the paper trained on.
+# `good` is what can be asked of a clean reference; `bad` lies beyond the worst of the public HDMI motions, which
+# policies have been trained on.
 LIMITS: dict[str, Limit] = {
-    # consistency
+    # names and consistency
+    "missing_joints": Limit(6, 14, "joints", "joints of the robot that the motion lacks: they hold the default pose"),
     "fk_position": Limit(0.005, 0.03, "m", "body position against forward kinematics of root and joints"),
     "fk_orientation": Limit(0.02, 0.1, "rad", "body orientation against forward kinematics"),
     "joint_velocity_error": Limit(1.0, 5.0, "rad/s", "stored joint velocity against differences of positions", 0.01),
