@@ -292,7 +292,7 @@ def _model(options: IkOptions, obstacles: Sequence[Obstacle]) -> tuple[mujoco.Mj
         if obstacle.name in g1.BODY_NAMES:
             raise ValueError(f"obstacle {obstacle.name!r}: is the name of a body of the robot")
         body = spec.worldbody.add_body(name=obstacle.name, mocap=True)
-        add_geoms(spec, body, obstacle.geoms, mass=None, friction=1.0, rgba=(0.5, 0.5, 0.5, 1.0))
+        add_geoms(spec, body, obstacle.geoms, mass=0.0, friction=1.0, rgba=(0.5, 0.5, 0.5, 1.0))
     model = _with_reach(spec.compile())
     return model, [int(model.body(obstacle.name).mocapid[0]) for obstacle in obstacles]
 
