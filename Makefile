@@ -7,7 +7,7 @@ PYTHON ?= python3
 #   PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu make install
 # or name another build: make install TORCH='torch==2.13.0+cu130' (with its index, as above).
 TORCH ?= torch==2.13.0
-# Overrides for `make train`, for example: make train ARGS='task=push_box seed=1'
+# Overrides for `make train`, for example: make train ARGS='task=push_box seed=1'; options of pytest for `make test`
 ARGS ?=
 
 VENV := .venv
@@ -38,8 +38,8 @@ lint: $(STAMP) ## check style, formatting and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: $(STAMP) ## run the tests; HDMI_MOTIONS=FOLDER adds those on the public motions
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+test: $(STAMP) ## run the tests; HDMI_MOTIONS=FOLDER adds those on the public motions, ARGS='-m slow' runs the slow ones
+	$(BIN)/python -m pytest -n 2 --dist loadgroup $(ARGS)
 
 train: $(STAMP) ## train with the default configuration; ARGS='key=value ...' overrides it
 	$(BIN)/python train.py $(ARGS)

@@ -295,6 +295,10 @@ class TestContacts:
         assert error.max() < 0.01
         assert np.ptp(made.body_pos_w[:70, -1], axis=0).max() < 1e-6
         bare = replace(alone, object_contact=None)
+        fixed = replace(scene["object"], fixed_base=True)
+        first = Overrides(object={0: overrides.object[0]})
+        still = complete_object(bare, object=fixed, effectors=scene["effectors"], overrides=first)
+        assert np.ptp(still.body_pos_w[:, -1], axis=0).max() == 0
         with pytest.raises(MotionError, match="needs contacts"):
             complete_object(bare, object=scene["object"], effectors=scene["effectors"], overrides=overrides)
 

@@ -14,6 +14,8 @@ from hdmi.build import ConfigError
 from hdmi.learning import CheckpointError, Trainer, load_checkpoint
 from hdmi.learning.collectors import InlineCollector, ProcessCollector
 
+pytestmark = pytest.mark.xdist_group("collectors")  # its runs are made once, not in each process
+
 WORKERS = ("collector.num_workers=2", "collector.threads_per_worker=1")
 # every step ends an episode, by failure
 FAILING = ("reset=adaptive", "termination.root_pose.thresholds=[-1.0,-1.0]", "termination.root_pose.min_steps=1")

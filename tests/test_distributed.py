@@ -14,6 +14,8 @@ from test_training import ROOT, config
 from hdmi.learning import CheckpointError, RunningNorm, Trainer, load_checkpoint
 from hdmi.learning.distributed import Ranks
 
+pytestmark = pytest.mark.xdist_group("ranks")  # its runs are made once, not in each process
+
 ONE_STEP = ("algo.epochs=1", "algo.minibatches=1")
 OBSERVED = ("policy", "critic", "action", "action_log_prob", "scale", "next")
 

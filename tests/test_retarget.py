@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import numpy as np
 import people
 import pytest
 from scipy.spatial.transform import Rotation
+from sources import write_gvhmr
 
 from hdmi.assets import Effector, HingeConfig, ObjectConfig, g1
 from hdmi.motion import HumanMotion, Motion, MotionError, ObjectTrajectory, load_motion, make_reference, save_motion
@@ -291,3 +294,37 @@ def test_the_robots_own_walk_comes_back(public_motions: Path):
     known = [name for name in motion.joint_names if name in g1.JOINT_NAMES and "wrist" not in name]
     error = np.degrees([np.abs(joint(found, name) - joint(motion, name)).mean() for name in known])
     assert error.mean() < 5
+
+
+ROOT = Path(__file__).parents[1]
+
+
+class TestScript:
+    @staticmethod
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, str(ROOT / "scripts" / "retarget.py"), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=200)
+
+    def test_from_a_file_to_a_motion_and_a_report(self, tmp_path: Path):
+        source, out = write_gvhmr(tmp_path / "hmr4d_results.pt"), tmp_path / "wave"
+        done = self.run(f"source={source}", "source_fps=30", "height=1.8", f"out={out}")
+        assert done.returncode == 0, done.stderr
+        assert str(out) in done.stdout
+        assert load_motion(out).fps == 50.0
+        assert json.loads((out / "retarget.json").read_text())["name"] == "wave"
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["out=x"], "give source=PATH and out=FOLDER"),
+            (["source=none.bvh", "out=x"], "none.bvh: no such file"),
+            (["source=hmr4d_results.pt", "out=x"], "how fast the video is"),
+            (["source=x.csv", "out=x"], "say which format"),
+            (["source=none.bvh", "out=x", "format=fbx"], "there is no format 'fbx'"),
+        ],
+    )
+    def test_wrong_arguments_say_what_is_wrong(self, arguments: list[str], message: str, tmp_path: Path):
+        done = self.run(*arguments)
+        assert done.returncode == 2
+        assert message in done.stderr
+        assert "Traceback" not in done.stderr

@@ -34,6 +34,7 @@ def test_benchmark_ends_with_its_figures_as_json(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_sweep_runs_as_jobs(tmp_path: Path) -> None:
     pytest.importorskip("submitit")
     sweep = ["-m", "hydra/launcher=submitit_local", "+ablation=full,no_rsi", "seed=3"]
@@ -94,6 +95,7 @@ def test_adaptive_starts_count_the_terminations_of_the_whole_stack() -> None:
     assert 5.9 < float(adaptive.failures.sum()) <= 6.0
 
 
+@pytest.mark.slow
 def test_gpu_report_keeps_what_could_not_be_measured(tmp_path: Path) -> None:
     options = ["engines=[cpu,tpu]", "worlds=[2]", f"out={tmp_path / 'report.jsonl'}"]
     tiny = "overrides=[algo.frames_per_env=4,algo.bf16=false,num_threads=1,logger=csv,nonsense]"

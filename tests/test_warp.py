@@ -112,7 +112,9 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name.startswith("elliptic") else []) for name in SCENES]
+)
 def test_parity(name: str):
     """States, controls and randomization are the same, and so are states, forces and resets of some worlds after it."""
     scene, generator = SCENES[name](), torch.Generator().manual_seed(0)

@@ -68,14 +68,19 @@ def complete_object(
 ) -> Motion:
     """The motion with the object's trajectory, and its hinge's if it has one, made from keyframes.
 
-    Contacts are the overrides'; for an effector that they do not name, the motion's labels. An articulated object's
+    Contacts are the overrides'; for an effector that they do not name, the motion's labels; an object that is fixed
+    needs none. An articulated object's
     base follows its own keyframes only: what is in the hands is its link.
 
     Raises:
-        MotionError: without contacts, or without keyframes of the object's pose where the motion lacks it.
+        MotionError: without contacts of an object that moves, or without keyframes of the object's pose where the
+            motion lacks it.
     """
     names = [effector.body for effector in effectors]
-    contact = _given_labels(motion, names, overrides)
+    if object.fixed_base and not overrides.hinge:
+        contact = np.zeros((motion.num_frames, len(names)), bool)  # nothing that touches it moves it
+    else:
+        contact = _given_labels(motion, names, overrides)
     hand_pos = np.stack(
         [_body(motion, e.body)[0] + _rotate(_body(motion, e.body)[1], np.asarray(e.point, float)) for e in effectors], 1
     )

@@ -7,6 +7,7 @@ frame.
 from hdmi.motion.sources.bvh import read_bvh
 from hdmi.motion.sources.formats import FORMATS, convert, guess_format
 from hdmi.motion.sources.interaction import read_intermimic, read_omomo
+from hdmi.motion.sources.person import PERSON_FORMATS, read_person
 from hdmi.motion.sources.robot import (
     read_holosoma,
     read_mjlab,
@@ -19,6 +20,7 @@ from hdmi.motion.sources.smpl import read_amass, read_gvhmr
 
 __all__ = [
     "FORMATS",
+    "PERSON_FORMATS",
     "convert",
     "guess_format",
     "read_amass",
@@ -28,6 +30,7 @@ __all__ = [
     "read_intermimic",
     "read_mjlab",
     "read_omomo",
+    "read_person",
     "read_robot_csv",
     "write_holosoma",
     "write_mjlab",

@@ -1,0 +1,101 @@
+"""Makes a reference of the robot from a person's motion, with inverse kinematics (extra `retarget`).
+
+    python scripts/retarget.py source=PATH out=FOLDER [format=FORMAT] [object=TASK] [height=1.75] [source_fps=30]
+        [fps=50] [scale=0.72] [cutoff=6] [body_model=PATH] [self_collision=true] [name=NAME]
+
+Formats: `gvhmr` (hmr4d_results.pt; needs source_fps, the video's), `amass` (npz), `omomo` (npz), `intermimic` (pt),
+`bvh`; guessed from the file's name if not given. `object` is the task that describes the object of the motion (and
+the end effectors, whose contact labels the source may have). Lengths of the scene are scaled so that the person's legs
+become as long as the robot's, unless `scale` says otherwise; `height` is the person's, if the file does not tell.
+
+The reference is written to FOLDER (motion.npz, meta.json), with a report beside it (retarget.json). The exit status is
+0, 1 if frames could not be solved (they are in the report), 2 for wrong arguments or files.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import Progress
+
+from hdmi.build import ConfigError, scene_parts
+from hdmi.cli import USER_ERRORS
+from hdmi.evaluation.agents import task_config
+from hdmi.evaluation.options import parse_options
+from hdmi.motion import save_motion
+from hdmi.motion.ik import IkOptions
+from hdmi.motion.retarget import RetargetOptions, RetargetReport, retarget
+from hdmi.motion.retarget.retarget import SMOOTHING
+from hdmi.motion.sources import read_person
+
+
+@dataclass
+class Options:
+    """See the module."""
+
+    source: str | None = None
+    out: str | None = None
+    format: str | None = None
+    object: str | None = None
+    name: str | None = None
+    height: float | None = None
+    source_fps: float | None = None
+    body_model: str | None = None
+    fps: float = 50.0
+    scale: float | None = None
+    cutoff: float = 6.0
+    self_collision: bool = True
+
+
+def run(options: Options, console: Console) -> tuple[Path, RetargetReport]:
+    """Reads, retargets and writes; returns the folder and the report."""
+    if options.source is None or options.out is None:
+        raise ConfigError("give source=PATH and out=FOLDER")
+    human = read_person(
+        options.source, options.format, fps=options.source_fps, height=options.height, body_model=options.body_model
+    )
+    human = replace(human, name=options.name or Path(options.out).name)
+    parts: dict[str, Any] = {} if options.object is None else scene_parts(task_config(options.object))
+    how = RetargetOptions(
+        fps=options.fps,
+        cutoff=options.cutoff,
+        scale=options.scale,
+        ik=IkOptions(floor=0.0, smoothing=SMOOTHING, self_collision=0.005 if options.self_collision else None),
+    )
+    num_frames = human.resample(options.fps).num_frames
+    with Progress(console=console, transient=True) as progress:
+        bar = progress.add_task(human.name, total=num_frames)
+        motion, report = retarget(
+            human,
+            parts.get("object"),
+            effectors=parts.get("effectors", ()),
+            options=how,
+            on_frame=lambda frame: progress.update(bar, completed=frame + 1),
+        )
+    folder = save_motion(motion, options.out)
+    report.save(folder / "retarget.json")
+    return folder, report
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the script; returns its exit status."""
+    if arguments in (["-h"], ["--help"]):
+        print(__doc__)
+        return 0
+    console = Console() if sys.stdout.isatty() else Console(width=120)
+    try:
+        folder, report = run(parse_options(Options, arguments), console)
+    except (*USER_ERRORS, ImportError, OSError) as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 2
+    console.print(report.table())
+    print(folder)
+    return 1 if report.solver_failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
