@@ -384,6 +384,19 @@ class TestMeshes:
         assert (data.qvel[spin] > 9.0) == spins
         assert spins or abs(data.qvel[spin]) < 1.0
 
+    @pytest.mark.parametrize(("share", "slides"), [(0.8, False), (1.2, True)])
+    def test_floor_leaves_friction_to_the_object(self, share, slides):
+        """Coulomb: a box of 2 kg and friction 0.4 resists up to 0.4 * 2 * 9.81 N."""
+        crate = ObjectConfig("crate", [{"box": (0.1, 0.1, 0.05)}], mass=2.0, friction=0.4)
+        scene = scene_with(crate, placements={"crate": ((2.0, 0.0, 0.05), UPRIGHT)})
+        data = mujoco.MjData(scene.model)
+        data.qpos[:] = scene.default_qpos
+        start = data.qpos[scene.object_free_qpos]
+        data.xfrc_applied[scene.model.body("crate").id, 0] = share * 0.4 * 2.0 * 9.81
+        for _ in range(100):
+            mujoco.mj_step(scene.model, data)
+        assert (data.qpos[scene.object_free_qpos] - start > 0.02) == slides
+
     def test_flat_mesh_is_an_error(self, tmp_path):
         square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [1, 3, 2]], process=False)
         square.export(tmp_path / "square.obj")

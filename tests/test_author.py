@@ -20,7 +20,8 @@ from hdmi.motion.author.footsteps import (
     stances,
 )
 from hdmi.motion.author.footsteps import centre_of_pressure as planned_pressure
-from hdmi.motion.author.paths import PosePath, minimum_jerk, pose_path, value_path
+from hdmi.motion.author.paths import PosePath, pose_path, value_path
+from hdmi.motion.kinematics import minimum_jerk
 
 FILE = Path("plans/try.yaml")
 FPS = 50.0

@@ -16,7 +16,8 @@ from hdmi.assets import Effector, ObjectConfig, default_joint_pos, g1
 from hdmi.build import scene_parts
 from hdmi.evaluation.agents import task_config
 from hdmi.motion import Motion, find_motion, forward_kinematics, load_motion, robot_model, save_motion
-from hdmi.motion.kinematics import angular_velocity, derivative
+from hdmi.motion.kinematics import derivative
+from hdmi.motion.motion import motion_from_poses
 from hdmi.motion.validate import LIMITS, Limit, Series, judge, validate_motion
 
 FPS, T = 50.0, 60
@@ -45,18 +46,7 @@ def moved(
 
 def from_qpos(root_pos: np.ndarray, root_quat: np.ndarray, joint_pos: np.ndarray) -> Motion:
     pos, quat = forward_kinematics(root_pos, root_quat, joint_pos)
-    return Motion(
-        "made",
-        FPS,
-        g1.BODY_NAMES,
-        g1.JOINT_NAMES,
-        body_pos_w=pos,
-        body_quat_w=quat,
-        body_lin_vel_w=derivative(pos, FPS),
-        body_ang_vel_w=angular_velocity(quat, FPS),
-        joint_pos=joint_pos,
-        joint_vel=derivative(joint_pos, FPS),
-    )
+    return motion_from_poses("made", FPS, g1.BODY_NAMES, g1.JOINT_NAMES, pos, quat, joint_pos)
 
 
 def within(first: int, last: int, value: float) -> np.ndarray:
@@ -151,15 +141,8 @@ class TestRobot:
         assert report["joint_velocity"].faults[0].part == "left_knee_joint"
 
     def test_missing_joints(self):
-        motion = moved()
-        kept = [i for i, name in enumerate(g1.JOINT_NAMES) if "elbow" not in name and "shoulder" not in name]
-        arms_missing = replace(
-            motion,
-            joint_names=tuple(g1.JOINT_NAMES[i] for i in kept),
-            joint_pos=motion.joint_pos[:, kept],
-            joint_vel=motion.joint_vel[:, kept],
-        )
-        report = validate_motion(arms_missing)
+        kept = [name for name in g1.JOINT_NAMES if "elbow" not in name and "shoulder" not in name]
+        report = validate_motion(moved().with_joints(kept))
         assert (report["missing_joints"].value, report["missing_joints"].verdict) == (8, "usable")
         assert "left_elbow_joint" in report.notes[0]
 

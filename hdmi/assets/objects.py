@@ -108,11 +108,15 @@ class ObjectConfig:
 
 @dataclass(frozen=True)
 class SceneryConfig:
-    """A static body: never tracked, placed at the reference's pose of that name or at `pos`, `quat`."""
+    """A static body: never tracked, placed at the reference's pose of that name or at `pos`, `quat`.
+
+    Args:
+        friction: sliding friction. MuJoCo takes the larger one of a pair, so 0 leaves it to what touches the body.
+    """
 
     name: str
     geoms: Sequence[Any] = field(default_factory=tuple)
-    friction: float = 1.0
+    friction: float = 0.0
     pos: Sequence[float] | None = None
     quat: Sequence[float] = _IDENTITY
     rgba: Sequence[float] = (0.55, 0.58, 0.62, 1.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from hdmi.build import scene_parts
 from hdmi.evaluation.agents import CONF, task_config
 from hdmi.motion import Motion, load_motion
 from hdmi.motion.playback import Playback, make_playback
-from hdmi.motion.validate.checks import contact_positions, limits, moves_with_robot
+from hdmi.motion.validate.checks import limits, moves_with_robot
 
 _CUBE = (0.05, 0.05, 0.05)  # half extents of an object that no task describes, m
 
@@ -53,13 +52,7 @@ def _task_of(motion: Motion) -> str | None:
 
 
 def _bare_playback(motion: Motion) -> Playback:
-    keep = [j for j, name in enumerate(motion.joint_names) if name in g1.JOINT_NAMES]
-    motion = replace(
-        motion,
-        joint_names=tuple(motion.joint_names[j] for j in keep),
-        joint_pos=motion.joint_pos[:, keep],
-        joint_vel=motion.joint_vel[:, keep],
-    )
+    motion = motion.with_joints(g1.JOINT_NAMES)
     robot = make_playback(motion)
     others = [name for name in motion.body_names if name not in g1.BODY_NAMES and not moves_with_robot(robot, name)]
     if not others:
@@ -84,8 +77,8 @@ def curves(playback: Playback, other: Playback | None = None) -> Mapping[str, np
     if scene.object_geoms.size:
         found["inside the object [cm]"] = 100 * (-playback.object_distance).clip(min=0).max(axis=1)
     if scene.effectors:
-        point, target = contact_positions(playback)
-        gaps = np.where(reference.contact.numpy(), 100 * np.linalg.norm(point - target, axis=-1), np.nan)
+        apart = np.linalg.norm(playback.effector_pos_w - playback.contact_pos_w, axis=-1)
+        gaps = np.where(reference.contact.numpy(), 100 * apart, np.nan)
         names = [effector.body.removesuffix("_link") for effector in scene.effectors]
         found |= {f"contact gap, {name} [cm]": gap for name, gap in zip(names, gaps.T, strict=True)}
     found["joint speed [%]"] = 100 * limits(playback)["joint_velocity"].values.max(axis=1)

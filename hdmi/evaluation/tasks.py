@@ -26,7 +26,6 @@ from hdmi.evaluation.video import Moment, Overlay, picture, replay
 from hdmi.learning import Trainer
 from hdmi.motion import MotionError, find_motion, load_motion, make_playback
 from hdmi.motion.annotate import intervals
-from hdmi.motion.validate.checks import contact_positions
 
 _SPEC_ENVS, _EPISODES = 2, 16
 _DISTANCE = 3.2  # of the camera, m
@@ -126,8 +125,7 @@ def measure_contacts(cfg: DictConfig) -> list[Contact]:
     if not effectors:
         return []
     label = playback.reference.contact.numpy()
-    point, target = contact_positions(playback)
-    distance = np.linalg.norm(point - target, axis=-1)  # [T, E]
+    distance = np.linalg.norm(playback.effector_pos_w - playback.contact_pos_w, axis=-1)  # [T, E]
     contacts = []
     for e, effector in enumerate(effectors):
         own = playback.robot_geoms[playback.on_bodies([effector.body])]

@@ -12,7 +12,6 @@ import trimesh
 from hdmi.evaluation.reference_view import curves
 from hdmi.evaluation.video import RenderingError
 from hdmi.motion.playback import Playback
-from hdmi.motion.validate.checks import contact_positions
 
 _GHOST = (51, 115, 242)
 _INTENDED, _NOT_INTENDED = (255, 209, 26), (140, 140, 148)
@@ -42,7 +41,7 @@ class ReferenceViewer:
         self.playback, self.ghost = playback, ghost
         self._poses = _poses(playback)
         self._ghost_poses = None if ghost is None else _poses(ghost)
-        self._points = contact_positions(playback)[1] if playback.scene.effectors else None  # [T, E, 3]
+        self._points = playback.contact_pos_w if playback.scene.effectors else None  # [T, E, 3]
         self._curves = curves(playback, ghost)
         self._time = np.arange(playback.num_frames) / playback.fps
         self.frame = 0

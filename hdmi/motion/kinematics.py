@@ -88,3 +88,14 @@ def interpolate_quat(quat: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.n
 def nearest_frames(old: np.ndarray, new: np.ndarray) -> np.ndarray:
     """Index of the time in `old` that is nearest to each in `new`. [T']"""
     return np.searchsorted((old[:-1] + old[1:]) / 2, new)
+
+
+def minimum_jerk(phase: np.ndarray) -> np.ndarray:
+    """From 0 to 1 as `phase` goes from 0 to 1, at rest at both ends."""
+    u = np.clip(phase, 0.0, 1.0)
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def smoothing_window(num_frames: int, fps: float, span: float = 0.18) -> int:
+    """Odd number of frames, at most the motion's, that a Savitzky-Golay filter over `span` seconds takes."""
+    return min(round(span * fps) // 2 * 2 + 1, (num_frames - 1) // 2 * 2 + 1)

@@ -18,7 +18,8 @@ motion.npz, float32, world frame, quaternions wxyz:
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,47 @@ class Motion:
     @property
     def num_frames(self) -> int:
         return len(self.joint_pos)
+
+    def with_joints(self, names: Collection[str]) -> Motion:
+        """The motion with those of its joints that are among `names`, in its own order."""
+        kept = [j for j, name in enumerate(self.joint_names) if name in names]
+        return replace(
+            self,
+            joint_names=tuple(self.joint_names[j] for j in kept),
+            joint_pos=self.joint_pos[:, kept],
+            joint_vel=self.joint_vel[:, kept],
+        )
+
+
+def motion_from_poses(
+    name: str,
+    fps: float,
+    body_names: Sequence[str],
+    joint_names: Sequence[str],
+    body_pos_w: np.ndarray,
+    body_quat_w: np.ndarray,
+    joint_pos: np.ndarray,
+    object_contact: np.ndarray | None = None,
+    contact_points: np.ndarray | None = None,
+) -> Motion:
+    """A motion in float32 whose velocities are central differences of its poses; arguments as the fields of `Motion`."""
+    arrays = {
+        "body_pos_w": body_pos_w,
+        "body_quat_w": body_quat_w,
+        "body_lin_vel_w": derivative(body_pos_w, fps),
+        "body_ang_vel_w": angular_velocity(body_quat_w, fps),
+        "joint_pos": joint_pos,
+        "joint_vel": derivative(joint_pos, fps),
+    }
+    return Motion(
+        name=name,
+        fps=fps,
+        body_names=tuple(body_names),
+        joint_names=tuple(joint_names),
+        object_contact=object_contact,
+        contact_points=None if contact_points is None else contact_points.astype(np.float32),
+        **{key: value.astype(np.float32) for key, value in arrays.items()},
+    )
 
 
 _REQUIRED = {"body_pos_w": 3, "body_quat_w": 4, "joint_pos": None}

@@ -11,11 +11,11 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from hdmi.assets import Effector, ObjectConfig, RobotConfig, Scene, SceneryConfig, SimConfig, build_scene
+from hdmi.motion.kinematics import smoothing_window
 from hdmi.motion.motion import Motion
 from hdmi.motion.reference import Reference, make_reference
 
 FAR = 0.5  # m; distances between geoms are not looked for beyond it
-_SMOOTHING = 0.18  # s; window of the filter that velocities and accelerations come from
 
 
 def reference_qpos(scene: Scene, reference: Reference, frames: int | slice = slice(None)) -> np.ndarray:
@@ -86,6 +86,21 @@ class Playback:
         others = [*self.scene.body_ids, *model.geom_bodyid[self.scene.object_geoms]]
         return np.flatnonzero(~np.isin(model.geom_bodyid, others))
 
+    @cached_property
+    def effector_pos_w(self) -> np.ndarray:
+        """The effectors' points, m. [T, E, 3]"""
+        points = []
+        for effector in self.scene.effectors:
+            pos, mat = self.body_poses(effector.body)
+            points.append(pos + mat @ np.asarray(effector.point, float))
+        return np.stack(points, axis=1)
+
+    @cached_property
+    def contact_pos_w(self) -> np.ndarray:
+        """The contact points on the object that the effectors' points are to meet, m. [T, E, 3]"""
+        pos, mat = self.body_poses(self.scene.object_link)
+        return pos[:, None] + np.einsum("tij,tej->tei", mat, self.reference.contact_point.numpy())
+
     def on_bodies(self, bodies: Sequence[str]) -> np.ndarray:
         """Which of the robot's collision geoms are on the given bodies. bool [R]"""
         ids = [self.scene.model.body(name).id for name in bodies]
@@ -134,7 +149,7 @@ class Playback:
         for t in range(self.num_frames):
             before, after = max(t - 1, 0), min(t + 1, last)
             mujoco.mj_differentiatePos(model, rough[t], (after - before) / fps, self.qpos[before], self.qpos[after])
-        window = min(round(_SMOOTHING * fps) // 2 * 2 + 1, (self.num_frames - 1) // 2 * 2 + 1)
+        window = smoothing_window(self.num_frames, fps)
         if window < 5:
             return rough, np.gradient(rough, 1 / fps, axis=0)
         smooth: Callable[..., np.ndarray] = savgol_filter

@@ -6,7 +6,6 @@ annotated = annotate_motion(motion, object=box, effectors=hands, overrides=load_
 from hdmi.motion.annotate.annotate import Agreement, agreement, annotate_motion, complete_object
 from hdmi.motion.annotate.contacts import (
     ContactCriteria,
-    Contacts,
     contact_points,
     find_contacts,
     intervals,
@@ -20,7 +19,6 @@ __all__ = [
     "FILE",
     "Agreement",
     "ContactCriteria",
-    "Contacts",
     "Interval",
     "Overrides",
     "Surface",

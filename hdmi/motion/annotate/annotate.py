@@ -50,9 +50,7 @@ def annotate_motion(
         scenery=scenery,
         effectors=effectors,
     )
-    found = find_contacts(playback, object, criteria)
-    label = _override_labels(found.label, names, overrides)
-    # the points of the intervals that hold in the end
+    label = _override_labels(find_contacts(playback, object, criteria), names, overrides)
     point = contact_points(playback, object, label)
     for e, name in enumerate(names):
         if name in overrides.points:

@@ -47,27 +47,20 @@ class ContactCriteria:
     lead: float = 1.0
 
 
-@dataclass(frozen=True)
-class Contacts:
-    """Contacts found in a motion, one column for each effector."""
-
-    label: np.ndarray  # bool [T, E]
-    point: np.ndarray  # [T, E, 3] on the object's surface, in its link's frame
-    gap: np.ndarray  # [T, E] m, of the surfaces; negative inside
-
-
-def find_contacts(playback: Playback, config: ObjectConfig, criteria: ContactCriteria | None = None) -> Contacts:
-    """Finds when effectors touch the object, and where.
+def find_contacts(playback: Playback, config: ObjectConfig, criteria: ContactCriteria | None = None) -> np.ndarray:
+    """Finds when effectors touch the object. bool [T, E]
 
     Contact is nearness of the surfaces, with hysteresis, that is no passing by; in a wider range while the object moves
     along. It counts where the object is moved, and for a while around that: hands that rest on an object that nobody
-    moves do not interact with it. The contact point of an interval is the point of the surface nearest to the
-    effector's, in the median.
+    moves do not interact with it.
+
+    Raises:
+        MotionError: for an effector without a collision shape.
     """
     surfaces = object_surfaces(config)
     gap = np.stack([_gap(playback, effector.body, surfaces) for effector in playback.scene.effectors], axis=1)
     label, _ = label_contacts(playback, gap, criteria)
-    return Contacts(label, contact_points(playback, config, label), gap)
+    return label
 
 
 def label_contacts(
@@ -92,7 +85,8 @@ def label_contacts(
 def contact_points(playback: Playback, config: ObjectConfig, label: np.ndarray) -> np.ndarray:
     """One point for each interval of contact, on the object's surface, in its link's frame. [T, E] -> [T, E, 3]
 
-    Between intervals the point is that of the nearest one; an effector without any keeps its target.
+    It is the point of the surface nearest to the effector's, in the median over the interval. Between intervals the
+    point is that of the nearest one; an effector without any keeps its target.
     """
     surfaces = object_surfaces(config)
     surface = surfaces.get(config.link) or surfaces[config.name]
@@ -113,14 +107,8 @@ def contact_points(playback: Playback, config: ObjectConfig, label: np.ndarray) 
 
 def effector_points(playback: Playback) -> np.ndarray:
     """The effectors' points in the frame of the object's link. [T, E, 3]"""
-    scene = playback.scene
-    link_pos, link_mat = playback.body_poses(scene.object_link)
-    points = []
-    for effector in scene.effectors:
-        pos, mat = playback.body_poses(effector.body)
-        point_w = pos + mat @ np.asarray(effector.point, float)
-        points.append(np.einsum("tji,tj->ti", link_mat, point_w - link_pos))
-    return np.stack(points, axis=1)
+    link_pos, link_mat = playback.body_poses(playback.scene.object_link)
+    return np.einsum("tji,tej->tei", link_mat, playback.effector_pos_w - link_pos[:, None])
 
 
 def _gap(playback: Playback, body: str, surfaces: Mapping[str, Surface]) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from hdmi.motion.check import MotionError
+from hdmi.motion.kinematics import minimum_jerk
 
 X = TypeVar("X")
 Pose = tuple[np.ndarray, Rotation]
@@ -135,8 +136,7 @@ def _complete(
             late[t - 1] = follow(t, t - 1, late[t])
         held = (contact[first:last] & contact[first + 1 : last + 1]).any(axis=1)
         passed = np.cumsum(held if held.any() else np.ones_like(held)).astype(float)
-        u = passed / passed[-1]
-        weights = u**3 * (10 - 15 * u + 6 * u**2)  # minimum jerk
+        weights = minimum_jerk(passed / passed[-1])
         for t in range(first + 1, last):
             out[t] = blend(early[t], late[t], float(weights[t - first - 1]))
     return [out[t] for t in range(len(contact))]

@@ -16,10 +16,10 @@ from hdmi.motion import ik
 from hdmi.motion.author.balance import Load, centre_of_pressure, pendulum_com
 from hdmi.motion.author.footsteps import centre_of_pressure as planned_pressure
 from hdmi.motion.author.footsteps import foot_path, footprints, plan_steps, root_path
-from hdmi.motion.author.paths import PosePath, about, minimum_jerk, pose_path, rotation, value_path
+from hdmi.motion.author.paths import PosePath, about, pose_path, rotation, value_path
 from hdmi.motion.author.plan import SIDES, Plan, PlanError, PoseKey
-from hdmi.motion.kinematics import angular_velocity, derivative, forward_kinematics
-from hdmi.motion.motion import Motion
+from hdmi.motion.kinematics import derivative, forward_kinematics, minimum_jerk
+from hdmi.motion.motion import Motion, motion_from_poses
 
 FPS = 50.0
 HANDS = {side: f"{side}_wrist_yaw_link" for side in SIDES}
@@ -365,23 +365,8 @@ def _motion(
     pos = np.stack([pos for pos, _ in bodies.values()], axis=1)
     quat = np.stack([quat for _, quat in bodies.values()], axis=1)
     joint_pos = np.stack(list(joints.values()), axis=1)
-    arrays = {
-        "body_pos_w": pos,
-        "body_quat_w": quat,
-        "body_lin_vel_w": derivative(pos, FPS),
-        "body_ang_vel_w": angular_velocity(quat, FPS),
-        "joint_pos": joint_pos,
-        "joint_vel": derivative(joint_pos, FPS),
-    }
-    return Motion(
-        name=plan.name,
-        fps=FPS,
-        body_names=tuple(bodies),
-        joint_names=tuple(joints),
-        object_contact=contact if contact.shape[1] else None,
-        contact_points=points.astype(np.float32) if contact.shape[1] else None,
-        **{key: value.astype(np.float32) for key, value in arrays.items()},
-    )
+    labels = (contact, points) if contact.shape[1] else (None, None)
+    return motion_from_poses(plan.name, FPS, tuple(bodies), tuple(joints), pos, quat, joint_pos, *labels)
 
 
 def _report(plan: Plan, result: ik.IkResult, motion: Motion, load: Load, paths: _Paths, time: np.ndarray) -> Authored:

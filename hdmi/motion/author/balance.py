@@ -11,11 +11,10 @@ from scipy.linalg import solve_banded
 from scipy.signal import savgol_filter
 
 from hdmi.assets import g1
-from hdmi.motion.kinematics import robot_model
+from hdmi.motion.kinematics import robot_model, smoothing_window
 
 GRAVITY = 9.81
 COM_HEIGHT = 0.65  # above the ground, of the linear inverted pendulum, m
-SMOOTHING = 0.18  # s; window of the filter that accelerations come from
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ def centre_of_pressure(qpos: np.ndarray, load: Load, ground: np.ndarray, fps: fl
         mujoco.mj_comVel(model, data)
         mujoco.mj_subtreeVel(model, data)
         com[t], spin[t] = data.subtree_com[1], data.subtree_angmom[1]
-    window = min(round(SMOOTHING * fps) // 2 * 2 + 1, (len(qpos) - 1) // 2 * 2 + 1)
+    window = smoothing_window(len(qpos), fps)
     smooth = partial(savgol_filter, window_length=window, polyorder=2, axis=0, delta=1 / fps)
     up = np.array([0.0, 0.0, GRAVITY])
     floor = np.column_stack([np.zeros((len(qpos), 2)), ground])

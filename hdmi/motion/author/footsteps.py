@@ -10,8 +10,9 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from hdmi.assets import g1
-from hdmi.motion.author.paths import PosePath, about, minimum_jerk, pose_path, value_path
+from hdmi.motion.author.paths import PosePath, about, pose_path, value_path
 from hdmi.motion.author.plan import SIDES, Plan, PlanError, PoseKey, Step, Walk
+from hdmi.motion.kinematics import minimum_jerk
 
 ANKLE_HEIGHT = -g1.FOOT_POINTS[0][2] + g1.FOOT_POINT_RADIUS  # soles on the floor, m
 TOES = (g1.FOOT_POINTS[0][0], 0.0, -ANKLE_HEIGHT)  # in the ankle's frame

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hdmi.motion.author.plan import PlanError, PoseKey, ValueKey, Vector
+from hdmi.motion.kinematics import minimum_jerk
 
 
 @dataclass(frozen=True)
@@ -32,12 +33,6 @@ class PosePath:
     def fixed(pos: Sequence[float], rot: Rotation, num_frames: int) -> PosePath:
         """A pose that does not move."""
         return PosePath(np.tile(np.asarray(pos, float), (num_frames, 1)), Rotation.concatenate([rot] * num_frames))
-
-
-def minimum_jerk(phase: np.ndarray) -> np.ndarray:
-    """From 0 to 1 as `phase` goes from 0 to 1, at rest at both ends."""
-    u = np.clip(phase, 0.0, 1.0)
-    return u**3 * (10 - 15 * u + 6 * u**2)
 
 
 def blend(first: PosePath, second: PosePath, share: np.ndarray) -> PosePath:

@@ -21,8 +21,8 @@ from hdmi.assets.robot import per_joint
 from hdmi.motion import ik
 from hdmi.motion.check import MotionError
 from hdmi.motion.human import HumanMotion, ObjectTrajectory
-from hdmi.motion.kinematics import angular_velocity, derivative, forward_kinematics
-from hdmi.motion.motion import Motion
+from hdmi.motion.kinematics import forward_kinematics
+from hdmi.motion.motion import Motion, motion_from_poses
 from hdmi.motion.retarget.body import (
     PALM,
     SIDES,
@@ -179,7 +179,6 @@ def _motion(
     effectors: Sequence[Effector],
     result: ik.IkResult,
 ) -> Motion:
-    fps = human.fps
     pos, quat = forward_kinematics(result.root_pos, result.root_quat, result.joint_pos)
     joint_pos, body_names, joint_names = result.joint_pos, g1.BODY_NAMES, g1.JOINT_NAMES
     if scaled is not None:
@@ -190,22 +189,8 @@ def _motion(
             angle = np.zeros(len(pos)) if scaled.joint_pos is None else scaled.joint_pos
             joint_names = (*joint_names, object.hinge.name)
             joint_pos = np.concatenate([joint_pos, angle[:, None]], axis=1)
-    arrays = {
-        "body_pos_w": pos,
-        "body_quat_w": quat,
-        "body_lin_vel_w": derivative(pos, fps),
-        "body_ang_vel_w": angular_velocity(quat, fps),
-        "joint_pos": joint_pos,
-        "joint_vel": derivative(joint_pos, fps),
-    }
-    return Motion(
-        name=human.name,
-        fps=fps,
-        body_names=body_names,
-        joint_names=joint_names,
-        object_contact=_contact(human, effectors),
-        **{key: value.astype(np.float32) for key, value in arrays.items()},
-    )
+    contact = _contact(human, effectors)
+    return motion_from_poses(human.name, human.fps, body_names, joint_names, pos, quat, joint_pos, contact)
 
 
 def _contact(human: HumanMotion, effectors: Sequence[Effector]) -> np.ndarray | None:

@@ -186,27 +186,13 @@ def labels(playback: Playback) -> dict[str, Series]:
     names = [effector.body for effector in scene.effectors]
     gaps = [playback.object_distance[:, playback.on_bodies([name])].min(axis=1, initial=FAR) for name in names]
     surface = np.stack(gaps, axis=1)  # [T, E]
-    point, target = contact_positions(playback)
-    apart = np.linalg.norm(point - target, axis=-1)
+    apart = np.linalg.norm(playback.effector_pos_w - playback.contact_pos_w, axis=-1)
     found, speed = label_contacts(playback, surface)
     return {
         "contact_gap": Series(np.where(label, surface.clip(min=0), np.nan), names),
         "contact_point": Series(np.where(label, apart, np.nan), names),
         "unlabelled_contact": Series(np.where(label, np.nan, np.where(found, speed, 0.0)), names),
     }
-
-
-def contact_positions(playback: Playback) -> tuple[np.ndarray, np.ndarray]:
-    """Effectors' points and their contact points on the object, in the world. [T, E, 3], [T, E, 3]"""
-    scene = playback.scene
-    link_pos, link_mat = playback.body_poses(scene.object_link)
-    target = link_pos[:, None] + np.einsum("tij,tej->tei", link_mat, playback.reference.contact_point.numpy())
-    poses = [playback.body_poses(effector.body) for effector in scene.effectors]
-    points = [
-        pos + mat @ np.asarray(effector.point, float)
-        for effector, (pos, mat) in zip(scene.effectors, poses, strict=True)
-    ]
-    return np.stack(points, axis=1), target
 
 
 def _geom_name(playback: Playback, geom: int) -> str:
