@@ -72,7 +72,7 @@ def motion_from_poses(
     object_contact: np.ndarray | None = None,
     contact_points: np.ndarray | None = None,
 ) -> Motion:
-    """A motion in float32 whose velocities are central differences of its poses; arguments as the fields of `Motion`."""
+    """A float32 motion whose velocities are central differences of its poses; arguments as the fields of `Motion`."""
     arrays = {
         "body_pos_w": body_pos_w,
         "body_quat_w": body_quat_w,
