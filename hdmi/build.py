@@ -15,7 +15,7 @@ from rich.table import Table
 from torchrl.envs import CatTensors, Compose, RemoveEmptySpecs, SelectTransform, Transform
 
 from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene
-from hdmi.envs import BatchBackend, HumanoidObjectEnv, MaskedResetEnv, PhysicsBackend, RowResetEnv
+from hdmi.envs import HumanoidObjectEnv, MaskedResetEnv, PhysicsBackend, RowResetEnv
 from hdmi.motion import Reference, find_motion, make_reference
 
 # What leaves the stack besides the state that steps read back.
@@ -133,11 +133,10 @@ def make_task(cfg: DictConfig) -> Task:
 
 def backend_of(cfg: DictConfig) -> Callable[[mujoco.MjModel, int], PhysicsBackend]:
     """What makes the physics backend of a config's sim node from a model and a number of worlds."""
-    node = cfg.sim.get("backend") or {"_target_": f"{BatchBackend.__module__}.{BatchBackend.__qualname__}"}
 
     def make(model: mujoco.MjModel, num_worlds: int) -> PhysicsBackend:
-        given = {"device": cfg.sim.get("device"), "num_threads": cfg.num_threads}
-        backend: PhysicsBackend = build(node, "sim.backend", model=model, num_worlds=num_worlds, **given)
+        given = {"device": cfg.sim.device, "num_threads": cfg.num_threads}
+        backend: PhysicsBackend = build(cfg.sim.backend, "sim.backend", model=model, num_worlds=num_worlds, **given)
         return backend
 
     return make

@@ -64,11 +64,14 @@ def finish(cfg: DictConfig, folder: Path, console: Console) -> None:
 
 
 def run_folder(cfg: DictConfig) -> Path:
-    """The folder of a new run, or the one to continue.
+    """The folder of a new run, or the one to continue. Notes in the config what it was called with.
 
     Raises:
         CheckpointError: if a new run would go into the folder of an old one.
     """
+    if HydraConfig.initialized():
+        with open_dict(cfg):
+            cfg.overrides = list(HydraConfig.get().overrides.task)
     if cfg.resume is not None:
         path = Path(cfg.resume)
         folder = path if path.is_dir() else path.parent.parent

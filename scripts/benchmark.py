@@ -4,7 +4,7 @@
 steps per second; blocks of the measurements alternate and medians are reported, so that the ratios hold even where the
 machine's speed drifts. Beside them stand other environments on the CPU (see conf/benchmark.yaml). The last line of
 the output is one JSON object. `sim=gpu` measures MuJoCo Warp; scripts/gpu_report.py tabulates engines by number of
-worlds.
+worlds. A grid is a multirun: `-m task=walk,push_box num_envs=256,512 out=grid.jsonl compare.steps=0`.
 """
 
 from __future__ import annotations
@@ -156,6 +156,8 @@ def transform_times(cfg: DictConfig, task: Task, policy: Any, count: int) -> dic
 
 def compare(options: DictConfig, scene: Scene) -> dict[str, float]:
     """Control steps per second of other environments: TorchRL's on the same scene, mjlab's on its own."""
+    if not options.steps:
+        return {}
     workers = options.mujoco_env_workers or os.cpu_count() or 1
     speeds = {
         "mujoco_env_sps": mujoco_env_speed(scene, 1, options.steps),
@@ -246,7 +248,11 @@ def main(cfg: DictConfig) -> None:
     step_ms = 1e3 * cfg.num_envs / result["env_sps"]
     console.print(part_times(result))
     console.print(f"one control step of {cfg.num_envs} worlds with everything on: {step_ms:.1f} ms")
-    print(json.dumps({key: round(v, 4) if isinstance(v, float) else v for key, v in result.items()}))
+    line = json.dumps({key: round(v, 4) if isinstance(v, float) else v for key, v in result.items()})
+    print(line)
+    if cfg.out is not None:
+        with Path(cfg.out).open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
 
 
 if __name__ == "__main__":

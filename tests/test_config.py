@@ -62,6 +62,14 @@ def stack_of(*overrides: str) -> dict[str, str]:
     return out
 
 
+def test_the_laptop_preset_is_what_lift_box_has():
+    cfg, paper, embedded = load_config("task=walk", "+preset=laptop"), load_config("task=walk"), load_config()
+    for node in ("algo", "robot.stiffness", "robot.damping", "reset.state.noise"):
+        assert OmegaConf.select(cfg, node) == OmegaConf.select(embedded, node) != OmegaConf.select(paper, node), node
+    for node in ("reward", "termination", "observation", "noise", "randomization", "action", "task"):
+        assert cfg[node] == paper[node]
+
+
 class TestAblations:
     def test_all_are_expected(self):
         assert set(ABLATIONS) == set(EXPECTED)

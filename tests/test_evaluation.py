@@ -21,8 +21,8 @@ from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy, pr
 from hdmi.evaluation.agents import BlindAgent
 from hdmi.evaluation.options import parse_options, parse_terminations
 from hdmi.evaluation.protocol import FirstEpisodes, StartAtFrame, evaluation_config, termination_names
-from hdmi.learning.checkpoint import CheckpointError, save_checkpoint
-from hdmi.learning.policy import make_networks
+from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from hdmi.learning.policy import load_policy, make_networks
 
 FIGURES = (
     "success_rate", "survival", "joint_error", "body_error", "root_pos_error", "root_ori_error", "object_pos_error",
@@ -182,7 +182,8 @@ def run(cfg: DictConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     state = {
         "config": OmegaConf.to_container(cfg, resolve=True),
-        "sizes": sizes, "actor": actor.state_dict(), "iteration": 3, "frames": 96,
+        "task": cfg.task.name, "sizes": sizes, "iteration": 3, "frames": 96, "elapsed": 120.0,
+        "actor": actor.state_dict(), "critic": {},
     }  # fmt: skip
     save_checkpoint(folder / "checkpoints" / "checkpoint_000003.pt", state)
     return folder
@@ -294,6 +295,34 @@ def test_the_policy_of_a_run_is_rendered_into_its_folder(run: Path, monkeypatch:
     monkeypatch.setattr(video, "every", lambda moments, stride: short(moments, 3))
     assert render_checkpoint(run, size=(96, 128)) == run / "video.mp4"
     assert len(imageio.mimread(run / "video.mp4")) == 3
+
+
+@pytest.mark.usefixtures("gl")
+def test_an_exported_policy_acts_like_its_checkpoint(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(video, "every", lambda moments, stride: short(moments, 3))
+    out = tmp_path / "zoo" / "lift_box"
+    assert script("export").main([f"checkpoint={run}", f"out={out}", "num_envs=2"]) == 0
+    assert {path.name for path in out.iterdir()} == {"policy.pt", "config.yaml", "eval.json", "video.mp4", "README.md"}
+    original, exported = (load_policy(path)[0] for path in (run, out))
+    assert original.state_dict().keys() == exported.state_dict().keys()
+    for name, value in original.state_dict().items():
+        assert torch.equal(value, exported.state_dict()[name]), name
+    assert "critic" not in load_checkpoint(out)
+    figures = json.loads((out / "eval.json").read_text())
+    assert (figures["checkpoint"], figures["num_envs"], figures["frames"]) == ("policy.pt", 2, 96)
+    card = (out / "README.md").read_text()
+    assert card == capsys.readouterr().out[:-1]
+    assert "after 96 frames, 2 minutes" in card
+    assert f"| survival | {100 * figures['survival']['mean']:.1f} % |" in card
+
+
+def test_export_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert script("export").main([f"checkpoint={tmp_path}"]) == 2
+    assert "give checkpoint=RUN and out=FOLDER" in capsys.readouterr().err
+    assert script("export").main([f"checkpoint={tmp_path}", f"out={tmp_path}"]) == 2
+    assert "no checkpoint_*.pt or policy.pt there" in capsys.readouterr().err
 
 
 def test_play_stops_a_second_after_a_failure(cfg: DictConfig):

@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 
 def test_benchmark_ends_with_its_figures_as_json(tmp_path: Path) -> None:
     options = ["num_envs=4", "algo.frames_per_env=4", "algo.bf16=false", "num_threads=1", "logger=csv"]
-    others = ["compare.mujoco_env_workers=1", "compare.steps=5", "compare.mjlab=/nonexistent/python"]
+    others = ["compare.mujoco_env_workers=1", "compare.steps=5", "compare.mjlab=/nonexistent/python", "out=grid.jsonl"]
     command = [sys.executable, str(ROOT / "scripts" / "benchmark.py"), *options, *others]
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=200)
     assert result.returncode == 0, result.stderr
@@ -31,7 +31,8 @@ def test_benchmark_ends_with_its_figures_as_json(tmp_path: Path) -> None:
     assert "/nonexistent/python" in result.stderr
     assert "tracking.bodies" in result.stdout
     assert "transforms, resets and reading" in result.stdout
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["grid.jsonl"]
+    assert json.loads((tmp_path / "grid.jsonl").read_text()) == figures
 
 
 @pytest.mark.slow

@@ -2,13 +2,14 @@
 
 from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from hdmi.learning.networks import RunningNorm, make_actor, make_critic
-from hdmi.learning.policy import load_config, load_policy
+from hdmi.learning.policy import export_policy, load_config, load_policy
 from hdmi.learning.trainer import Trainer
 
 __all__ = [
     "CheckpointError",
     "RunningNorm",
     "Trainer",
+    "export_policy",
     "load_checkpoint",
     "load_config",
     "load_policy",

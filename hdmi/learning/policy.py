@@ -9,7 +9,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
-from hdmi.learning.checkpoint import CheckpointError, find_checkpoint, load_checkpoint
+from hdmi.learning.checkpoint import CheckpointError, find_checkpoint, load_checkpoint, save_checkpoint
 from hdmi.learning.networks import make_actor, make_critic, use_bf16
 
 
@@ -57,3 +57,19 @@ def load_policy(
     except RuntimeError as error:
         raise CheckpointError(f"{file}: the actor does not fit its config: {error}") from error
     return actor.eval(), cfg, {"iteration": state["iteration"], "frames": state["frames"], "file": str(file)}
+
+
+def export_policy(source: str | Path, path: str | Path) -> Path:
+    """Writes the policy of a checkpoint alone: weights, normalization, config and counters, for `load_policy`.
+
+    Args:
+        source: a run folder (its newest checkpoint counts) or a checkpoint file.
+
+    Raises:
+        CheckpointError: if the checkpoint cannot be read.
+        OSError: if the file cannot be written.
+    """
+    state = load_checkpoint(source)
+    kept = ("config", "task", "sizes", "iteration", "frames", "elapsed", "actor")
+    save_checkpoint(Path(path), {key: state[key] for key in kept})
+    return Path(path)

@@ -288,9 +288,11 @@ class Trainer:
         """Continues from what `save` wrote.
 
         Raises:
-            CheckpointError: for a checkpoint of another task, of other sizes of observations or actions, or of
-                another number of environments, workers or ranks.
+            CheckpointError: for an exported policy, and for a checkpoint of another task, of other sizes of
+                observations or actions, or of another number of environments, workers or ranks.
         """
+        if "critic" not in state:
+            raise CheckpointError("resume: an exported policy, without critic and optimizers; it cannot be continued")
         if state["task"] != self.task.name:
             raise CheckpointError(
                 f"resume: a checkpoint of task {state['task']!r}, but the config says {self.task.name!r}"

@@ -1,0 +1,89 @@
+"""A trained policy to hand on: weights and normalization, evaluation, video, and a card that says where it is from."""
+
+from __future__ import annotations
+
+import os
+import platform
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from hdmi.evaluation.protocol import UNITS, EvalResult, evaluate_checkpoint
+from hdmi.evaluation.video import render_checkpoint
+from hdmi.learning import export_policy, load_checkpoint
+
+_SIZE = (240, 320)  # of the video, pixels
+
+
+def export(run_or_checkpoint: str | Path, folder: str | Path, num_envs: int = 256, seed: int = 0) -> Path:
+    """Writes policy.pt, config.yaml, eval.json, video.mp4 and README.md, evaluated and rendered from that policy.pt.
+
+    Args:
+        run_or_checkpoint: a run folder (its newest checkpoint counts) or a checkpoint file.
+        folder: is made if it is not there; `scripts/play.py checkpoint=FOLDER` and `scripts/evaluate.py` take it.
+
+    Raises:
+        CheckpointError: if there is no usable checkpoint.
+        ConfigError, MotionError: if its environment cannot be built here.
+        RenderingError: without OpenGL; says what to install.
+        OSError: if a file cannot be written.
+    """
+    folder = Path(folder)
+    policy = export_policy(run_or_checkpoint, folder / "policy.pt")
+    state = load_checkpoint(policy)
+    OmegaConf.save(OmegaConf.create(state["config"]), folder / "config.yaml")
+    result = evaluate_checkpoint(policy, num_envs, seed=seed)
+    render_checkpoint(policy, seed=seed, size=_SIZE)
+    (folder / "README.md").write_text(_card(state, result, folder, seed), encoding="utf-8")
+    return folder
+
+
+def _card(state: dict, result: EvalResult, folder: Path, seed: int) -> str:
+    """The text of README.md."""
+    config = state["config"]
+    command = " ".join(["python train.py", *config.get("overrides", ())])
+    rows = [f"| {name} | {_shown(name, value['mean'])} |" for name, value in result.figures().items()]
+    for name, share in result["termination_causes"].items():
+        if share:
+            rows.append(f"| failed by {name} | {100 * share:.1f} %, median frame {result['failure_frames'][name]:g} |")
+    lines = [
+        f"# {state['task']}",
+        "",
+        f"A policy after {state['frames']:,} frames, {state['elapsed'] / 60:.0f} minutes of collection and learning on "
+        f"{config['num_threads']} thread{'s' if config['num_threads'] > 1 else ''} of {_processor()} "
+        f"({os.cpu_count()} processors), seed {config['seed']}.",
+        "",
+        "```",
+        command,
+        f"python scripts/evaluate.py checkpoint={folder} num_envs={result['num_envs']} seed={seed}",
+        f"python scripts/play.py checkpoint={folder}",
+        "```",
+        "",
+        f"`policy.pt` holds the weights and the observations' normalization ({_megabytes(folder / 'policy.pt')} MB); "
+        "`config.yaml` is the whole config of the training, `eval.json` the evaluation from the first frame, under the "
+        "training's reset noise and randomization:",
+        "",
+        f"| {result['num_envs']} episodes | mean |",
+        "|---|---|",
+        *rows,
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _shown(name: str, value: float) -> str:
+    unit = UNITS.get(name, "")
+    return f"{100 * value:.1f} %" if unit == "%" else f"{value:.3g} {unit}".rstrip()
+
+
+def _megabytes(path: Path) -> str:
+    return f"{path.stat().st_size / 1e6:.1f}"
+
+
+def _processor() -> str:
+    """Name of this machine's processor, as far as the system tells it."""
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,49 @@
+"""Exports a trained policy: weights and normalization, config, evaluation, video and a card.
+
+    python scripts/export.py checkpoint=RUN out=FOLDER [num_envs=256] [seed=0]
+
+`checkpoint` is a run folder (its newest checkpoint counts) or a checkpoint file. The policy is evaluated and rendered
+from what was written; `scripts/evaluate.py` and `scripts/play.py` take FOLDER as their `checkpoint`.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+from hdmi.build import ConfigError
+from hdmi.cli import USER_ERRORS
+from hdmi.evaluation import RenderingError
+from hdmi.evaluation.card import export
+from hdmi.evaluation.options import parse_options
+
+
+@dataclass
+class Options:
+    """See the module."""
+
+    checkpoint: str | None = None
+    out: str | None = None
+    num_envs: int = 256
+    seed: int = 0
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the script; returns its exit status."""
+    if arguments in (["-h"], ["--help"]):
+        print(__doc__)
+        return 0
+    try:
+        options = parse_options(Options, arguments)
+        if options.checkpoint is None or options.out is None:
+            raise ConfigError("give checkpoint=RUN and out=FOLDER")
+        folder = export(options.checkpoint, options.out, options.num_envs, options.seed)
+    except (*USER_ERRORS, RenderingError, OSError) as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 2
+    print((folder / "README.md").read_text(encoding="utf-8"))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
