@@ -71,7 +71,8 @@ def run_folder(cfg: DictConfig) -> Path:
     """
     if HydraConfig.initialized():
         with open_dict(cfg):
-            cfg.overrides = list(HydraConfig.get().overrides.task)
+            # a continued run is the uninterrupted one
+            cfg.overrides = [text for text in HydraConfig.get().overrides.task if not text.startswith("resume=")]
     if cfg.resume is not None:
         path = Path(cfg.resume)
         folder = path if path.is_dir() else path.parent.parent
