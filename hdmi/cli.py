@@ -11,6 +11,7 @@ from omegaconf import DictConfig, open_dict
 from rich.console import Console
 
 from hdmi.build import ConfigError, describe, make_transforms
+from hdmi.console import make_console
 from hdmi.learning.checkpoint import CheckpointError, checkpoints
 from hdmi.learning.collectors import WorkerError
 from hdmi.learning.trainer import DivergenceError, Trainer
@@ -22,8 +23,7 @@ USER_ERRORS = (ConfigError, MotionError, CheckpointError, DivergenceError, Worke
 
 def main(cfg: DictConfig) -> None:
     """Runs one training from a config; leaves checkpoints, metrics.csv, eval.json and a video in its run folder."""
-    # tables keep their columns in log files
-    console = Console() if sys.stdout.isatty() else Console(width=150)
+    console = make_console()
     try:
         folder = run_folder(cfg)
         trainer = Trainer(cfg, folder)

@@ -26,7 +26,6 @@ import mujoco
 import torch
 from mujoco.batch import Batch
 from omegaconf import DictConfig
-from rich.console import Console
 from rich.table import Table
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -34,6 +33,7 @@ from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
 from hdmi.assets import Scene
 from hdmi.build import Task, backend_of, make_env, make_transforms
+from hdmi.console import make_console
 from hdmi.envs import BatchBackend
 from hdmi.evaluation.comparison import mjlab_speed, mujoco_env_speed
 from hdmi.learning import Trainer
@@ -191,7 +191,7 @@ def part_times(result: dict[str, Any]) -> Table:
 
 @hydra.main(config_path="../conf", config_name="benchmark", version_base="1.3")
 def main(cfg: DictConfig) -> None:
-    console = Console()
+    console = make_console()
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(cfg, Path(folder))
         env, policy = trainer.env, trainer.actor

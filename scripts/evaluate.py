@@ -15,10 +15,9 @@ import sys
 from dataclasses import dataclass
 from typing import Any
 
-from rich.console import Console
-
 from hdmi.build import ConfigError
 from hdmi.cli import USER_ERRORS
+from hdmi.console import make_console
 from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy
 from hdmi.evaluation.agents import AGENTS, BlindAgent, choose_engine, task_config
 from hdmi.evaluation.options import parse_options, parse_terminations
@@ -60,7 +59,7 @@ def main(arguments: list[str]) -> int:
     if arguments in (["-h"], ["--help"]):
         print(__doc__)
         return 0
-    console = Console()
+    console = make_console()
     try:
         options = parse_options(Options, arguments)
         if (options.checkpoint is None) == (options.agent is None):

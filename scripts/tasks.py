@@ -24,6 +24,7 @@ from rich.console import Console
 
 from hdmi.build import ConfigError, make_task
 from hdmi.cli import USER_ERRORS
+from hdmi.console import make_console
 from hdmi.evaluation.agents import task_config, task_names
 from hdmi.evaluation.options import parse_options
 from hdmi.evaluation.tasks import TaskCheck, check_table, check_task, list_tasks, render_reference, sources
@@ -94,8 +95,7 @@ def main(arguments: list[str]) -> int:
     if arguments in (["-h"], ["--help"]):
         print(__doc__)
         return 0
-    # tables keep their columns in log files
-    console = Console() if sys.stdout.isatty() else Console(width=200)
+    console = make_console(200)
     try:
         words = [argument for argument in arguments if "=" not in argument]
         options = parse_options(Options, [argument for argument in arguments if "=" in argument])

@@ -19,6 +19,7 @@ from torchrl.objectives.utils import KLAdaptiveLR
 from torchrl.objectives.value import GAE
 
 from hdmi.build import Task, build, make_task, set_threads
+from hdmi.console import make_console
 from hdmi.learning.checkpoint import CheckpointError, claim, load_checkpoint, rotate, save_checkpoint
 from hdmi.learning.distributed import Ranks
 from hdmi.learning.logger import RunLogger
@@ -203,8 +204,10 @@ class Trainer:
             TextColumn("[bold]{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
             TextColumn("{task.fields[numbers]}"),
         )  # fmt: skip
+        console = make_console()
+        visible = first and console.is_terminal
         try:
-            with Progress(*columns, refresh_per_second=2, disable=not first) as progress:
+            with Progress(*columns, console=console, refresh_per_second=2, disable=not visible) as progress:
                 frames_per_iteration = self.frames_per_batch * self.ranks.size
                 total = -(-cfg.total_frames // frames_per_iteration)
                 bar = progress.add_task(self.task.name, total=total, completed=self.iteration, numbers="")
@@ -230,8 +233,8 @@ class Trainer:
                     if logger is not None:
                         logger.log(self.iteration, row)
                     progress.update(bar, completed=self.iteration, numbers=_headline(row))
-                    if first and not progress.console.is_terminal and self.iteration % 10 == 0:
-                        progress.console.print(f"{self.iteration}/{total} {_headline(row)}", highlight=False)
+                    if first and not visible and (self.iteration % 10 == 0 or self.frames >= cfg.total_frames):
+                        console.print(f"{self.iteration}/{total} {_headline(row)}", highlight=False)
                     if self.iteration % cfg.checkpoint_interval == 0:
                         self.save()
                 if self.ranks.size > 1:
