@@ -1,8 +1,9 @@
-"""What `train.py` does: check the config, show the stack, train, evaluate, render."""
+"""What `train.py` does: check the config, show the stack, train, evaluate, render; and how every script runs."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
@@ -61,6 +62,40 @@ def finish(cfg: DictConfig, folder: Path, console: Console) -> None:
             console.print(f"video: {render_checkpoint(folder)}", soft_wrap=True)
         except (RenderingError, OSError) as error:
             console.print(f"no video: {error}", soft_wrap=True)
+
+
+def run_script(
+    body: Callable[[list[str], Console], int],
+    arguments: list[str],
+    doc: str | None,
+    *,
+    width: int = 150,
+    errors: tuple[type[Exception], ...] = (),
+) -> int:
+    """Runs a script: shows its help, or does what it is for; what a user can put right is one line, not a traceback.
+
+    Args:
+        body: does it, and returns the exit status.
+        doc: the help.
+        width: of tables, where the output is no terminal.
+        errors: what a user can put right besides `USER_ERRORS`, missing extras and what the file system says.
+
+    Returns:
+        The exit status: the body's, 0 after the help, 2 after a mistake, 130 when interrupted.
+    """
+    if arguments in (["-h"], ["--help"]):
+        print(doc)
+        return 0
+    console = make_console(width)
+    caught: tuple[type[Exception], ...] = (*USER_ERRORS, ImportError, OSError, *errors)
+    try:
+        return body(arguments, console)
+    except caught as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
 
 
 def run_folder(cfg: DictConfig) -> Path:

@@ -19,9 +19,9 @@ from rich.console import Console
 from rich.table import Table
 
 from hdmi.build import ConfigError, scene_parts
-from hdmi.cli import USER_ERRORS
+from hdmi.cli import run_script
 from hdmi.evaluation.agents import task_config
-from hdmi.evaluation.options import parse_options
+from hdmi.evaluation.options import parse_motion_options
 from hdmi.motion import Motion, load_motion, save_motion
 from hdmi.motion.annotate import FILE, agreement, annotate_motion, intervals, load_overrides
 
@@ -40,16 +40,18 @@ def table(motion: Motion, effectors: list[str], given: np.ndarray | None) -> Tab
     assert motion.object_contact is not None
     assert motion.contact_points is not None
     out = Table(title=f"{motion.name}: contacts", title_justify="left")
-    for column in ("effector", "frames", "points in the object's frame, m", "precision", "recall"):
-        out.add_column(column, justify="right" if column in ("precision", "recall") else "left")
+    for column in ("effector", "frames", "points in the object's frame, m"):
+        out.add_column(column)
+    for column in () if given is None else ("precision", "recall"):
+        out.add_column(column, justify="right")
     for e, name in enumerate(effectors):
         label = motion.object_contact[:, e]
         spans = intervals(label)
         points = [motion.contact_points[first, e] for first, _ in spans]
-        scores = ["", ""]
+        scores = []
         if given is not None:
             compared = agreement(label, given[:, min(e, given.shape[1] - 1)])
-            scores = [f"{compared.precision:.2f}", f"{compared.recall:.2f}"]
+            scores = [f"{x:.2f}" if np.isfinite(x) else "-" for x in (compared.precision, compared.recall)]
         out.add_row(
             name,
             "\n".join(f"{first}-{last}" for first, last in spans) or "none",
@@ -59,33 +61,32 @@ def table(motion: Motion, effectors: list[str], given: np.ndarray | None) -> Tab
     return out
 
 
-def main(arguments: list[str]) -> int:
-    """Runs the script; returns its exit status."""
-    if arguments in (["-h"], ["--help"]):
-        print(__doc__)
-        return 0
-    console = Console() if sys.stdout.isatty() else Console(width=150)
-    try:
-        paths = [argument for argument in arguments if "=" not in argument]
-        if len(paths) != 1:
-            raise ConfigError(f"give one motion folder, got {paths or 'none'}")
-        options = parse_options(Options, [argument for argument in arguments if "=" in argument])
-        motion = load_motion(paths[0])
-        parts = scene_parts(task_config(options.task or motion.name))
-        if parts["object"] is None:
-            raise ConfigError(f"task {options.task or motion.name!r}: has no object to touch")
-        beside = Path(paths[0]) / FILE
-        file = Path(options.overrides) if options.overrides else beside if beside.is_file() else None
-        annotated = annotate_motion(motion, **parts, overrides=load_overrides(file) if file else None)
-        folder = save_motion(annotated, options.out or Path("annotated") / motion.name)
-    except (*USER_ERRORS, OSError) as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 2
-    console.print(table(annotated, [effector.body for effector in parts["effectors"]], motion.object_contact))
+def annotate(arguments: list[str], console: Console) -> int:
+    """Annotates a motion, writes it, and shows its contacts."""
+    path, options = parse_motion_options(Options, arguments)
+    motion = load_motion(path)
+    parts = scene_parts(task_config(options.task or motion.name))
+    if parts["object"] is None:
+        raise ConfigError(f"task {options.task or motion.name!r}: has no object to touch")
+    beside = path / FILE
+    file = Path(options.overrides) if options.overrides else beside if beside.is_file() else None
+    annotated = annotate_motion(motion, **parts, overrides=load_overrides(file) if file else None)
+    folder = save_motion(annotated, options.out or Path("annotated") / motion.name)
+    effectors, given = [effector.body for effector in parts["effectors"]], motion.object_contact
+    if given is not None and given.shape[1] not in (1, len(effectors)):
+        given = None  # of other effectors
+    console.print(table(annotated, effectors, given))
+    if given is not None:
+        console.print("precision and recall are against the labels that the motion came with")
     if file is not None:
         console.print(f"with {file}", soft_wrap=True, highlight=False)
     console.print(f"{folder}", soft_wrap=True, highlight=False)
     return 0
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the script; returns its exit status."""
+    return run_script(annotate, arguments, __doc__)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from hdmi.build import ConfigError, scene_parts
-from hdmi.cli import USER_ERRORS
+from hdmi.cli import run_script
 from hdmi.evaluation.agents import task_config
 from hdmi.evaluation.options import parse_options
 from hdmi.motion import save_motion
@@ -55,7 +55,9 @@ def author(options: Options, console: Console) -> tuple[Authored, Path]:
 def table(authored: Authored) -> Table:
     """How well the plan came out."""
     motion = authored.motion
-    out = Table(title=f"{motion.name}: {motion.num_frames} frames, {motion.num_frames / motion.fps:.1f} s")
+    out = Table(
+        title=f"{motion.name}: {motion.num_frames} frames, {motion.num_frames / motion.fps:.1f} s", title_justify="left"
+    )
     out.add_column("what")
     out.add_column("figure", justify="right")
     for name, miss in authored.misses.items():
@@ -68,20 +70,17 @@ def table(authored: Authored) -> Table:
     return out
 
 
-def main(arguments: list[str]) -> int:
-    """Runs the script; returns its exit status."""
-    if arguments in (["-h"], ["--help"]):
-        print(__doc__)
-        return 0
-    console = Console() if sys.stdout.isatty() else Console(width=110)
-    try:
-        authored, folder = author(parse_options(Options, arguments), console)
-    except (*USER_ERRORS, ImportError, OSError) as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 2
+def show(arguments: list[str], console: Console) -> int:
+    """Solves the plan, and shows how well it came out."""
+    authored, folder = author(parse_options(Options, arguments), console)
     console.print(table(authored))
     print(folder)
     return 0
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the script; returns its exit status."""
+    return run_script(show, arguments, __doc__)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from rich.console import Console
 
 from hdmi.build import ConfigError
-from hdmi.cli import USER_ERRORS
+from hdmi.cli import run_script
 from hdmi.evaluation.options import parse_options
 from hdmi.motion.sources import FORMATS, convert
 from hdmi.motion.sources.formats import Options as FormatOptions
@@ -35,35 +35,34 @@ class Options:
     object: str | None = None
 
 
-def main(arguments: list[str]) -> int:
-    """Runs the script; returns its exit status."""
-    if arguments in (["-h"], ["--help"]):
-        print(__doc__)
-        return 0
-    console = Console(highlight=False, soft_wrap=True)
-    try:
-        options = parse_options(Options, arguments)
-        if options.source is None or options.out is None or options.to is None:
-            raise ConfigError(f"give source=PATH, out=PATH and to=, one of {', '.join(FORMATS)}")
-        motion, path, lost = convert(
-            options.source,
-            options.out,
-            options.to,
-            options.source_format,
-            FormatOptions(options.source_fps, options.object),
-            options.fps,
-        )
-    except (*USER_ERRORS, OSError) as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 2
+def write(arguments: list[str], console: Console) -> int:
+    """Converts a file, and says what of it the other format cannot hold."""
+    options = parse_options(Options, arguments)
+    if options.source is None or options.out is None or options.to is None:
+        raise ConfigError(f"give source=PATH, out=PATH and to=, one of {', '.join(FORMATS)}")
+    motion, path, lost = convert(
+        options.source,
+        options.out,
+        options.to,
+        options.source_format,
+        FormatOptions(options.source_fps, options.object),
+        options.fps,
+    )
     console.print(
         f"{motion.name}: {motion.num_frames} frames at {motion.fps:g} fps, {len(motion.body_names)} bodies, "
-        f"{len(motion.joint_names)} joints"
+        f"{len(motion.joint_names)} joints",
+        highlight=False,
+        soft_wrap=True,
     )
     for what in lost:
-        console.print(f"[yellow]{options.to} cannot hold[/yellow] {what}")
+        console.print(f"[yellow]{options.to} cannot hold[/yellow] {what}", highlight=False, soft_wrap=True)
     print(path)
     return 0
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the script; returns its exit status."""
+    return run_script(write, arguments, __doc__)
 
 
 if __name__ == "__main__":

@@ -15,9 +15,10 @@ import sys
 from dataclasses import dataclass
 from typing import Any
 
+from rich.console import Console
+
 from hdmi.build import ConfigError
-from hdmi.cli import USER_ERRORS
-from hdmi.console import make_console
+from hdmi.cli import run_script
 from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy
 from hdmi.evaluation.agents import AGENTS, BlindAgent, choose_engine, task_config
 from hdmi.evaluation.options import parse_options, parse_terminations
@@ -54,40 +55,37 @@ def evaluate_agent(options: Options, terminations: list[str] | None) -> EvalResu
     return result
 
 
-def main(arguments: list[str]) -> int:
-    """Runs the script; returns its exit status."""
-    if arguments in (["-h"], ["--help"]):
-        print(__doc__)
-        return 0
-    console = make_console()
-    try:
-        options = parse_options(Options, arguments)
-        if (options.checkpoint is None) == (options.agent is None):
-            raise ConfigError(f"give either checkpoint=RUN or agent=, one of {', '.join(AGENTS)}")
-        if options.num_envs < 1:
-            raise ConfigError(f"num_envs: expected at least 1, got {options.num_envs}")
-        terminations = parse_terminations(options.terminations)
-        if options.checkpoint is None:
-            result = evaluate_agent(options, terminations)
-        else:
-            result = evaluate_checkpoint(
-                options.checkpoint,
-                options.num_envs,
-                terminations,
-                options.seed,
-                options.out,
-                options.task,
-                options.motion_root,
-                options.num_threads,
-                options.sim,
-            )
-    except (*USER_ERRORS, OSError) as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 2
+def evaluate(arguments: list[str], console: Console) -> int:
+    """Evaluates, and shows the figures."""
+    options = parse_options(Options, arguments)
+    if (options.checkpoint is None) == (options.agent is None):
+        raise ConfigError(f"give either checkpoint=RUN or agent=, one of {', '.join(AGENTS)}")
+    if options.num_envs < 1:
+        raise ConfigError(f"num_envs: expected at least 1, got {options.num_envs}")
+    terminations = parse_terminations(options.terminations)
+    if options.checkpoint is None:
+        result = evaluate_agent(options, terminations)
+    else:
+        result = evaluate_checkpoint(
+            options.checkpoint,
+            options.num_envs,
+            terminations,
+            options.seed,
+            options.out,
+            options.task,
+            options.motion_root,
+            options.num_threads,
+            options.sim,
+        )
     console.print(result.table())
     if result.path is not None:
         print(result.path)
     return 0
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the script; returns its exit status."""
+    return run_script(evaluate, arguments, __doc__)
 
 
 if __name__ == "__main__":

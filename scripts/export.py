@@ -11,8 +11,10 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
+from rich.console import Console
+
 from hdmi.build import ConfigError
-from hdmi.cli import USER_ERRORS
+from hdmi.cli import run_script
 from hdmi.evaluation import RenderingError
 from hdmi.evaluation.card import export
 from hdmi.evaluation.options import parse_options
@@ -28,21 +30,20 @@ class Options:
     seed: int = 0
 
 
-def main(arguments: list[str]) -> int:
-    """Runs the script; returns its exit status."""
-    if arguments in (["-h"], ["--help"]):
-        print(__doc__)
-        return 0
-    try:
-        options = parse_options(Options, arguments)
-        if options.checkpoint is None or options.out is None:
-            raise ConfigError("give checkpoint=RUN and out=FOLDER")
-        folder = export(options.checkpoint, options.out, options.num_envs, options.seed)
-    except (*USER_ERRORS, RenderingError, OSError) as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 2
+def write(arguments: list[str], console: Console) -> int:
+    """Exports, and shows the card."""
+    del console
+    options = parse_options(Options, arguments)
+    if options.checkpoint is None or options.out is None:
+        raise ConfigError("give checkpoint=RUN and out=FOLDER")
+    folder = export(options.checkpoint, options.out, options.num_envs, options.seed)
     print((folder / "README.md").read_text(encoding="utf-8"))
     return 0
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the script; returns its exit status."""
+    return run_script(write, arguments, __doc__, errors=(RenderingError,))
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hdmi.build import ConfigError
-from hdmi.cli import USER_ERRORS
+from hdmi.cli import run_script
 from hdmi.evaluation.options import parse_options
 
 BENCHMARK = Path(__file__).with_name("benchmark.py")
@@ -68,18 +68,11 @@ def table_of(rows: Sequence[dict[str, Any]]) -> Table:
     return table
 
 
-def main(arguments: list[str]) -> int:
-    """Runs the script; returns its exit status."""
-    if arguments in (["-h"], ["--help"]):
-        print(__doc__)
-        return 0
-    try:
-        options = parse_options(Options, arguments)
-        if not options.engines or not options.worlds:
-            raise ConfigError("engines and worlds: give at least one of each")
-    except USER_ERRORS as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 2
+def report(arguments: list[str], console: Console) -> int:
+    """Measures one after the other, and shows the table."""
+    options = parse_options(Options, arguments)
+    if not options.engines or not options.worlds:
+        raise ConfigError("engines and worlds: give at least one of each")
     rows = []
     with Path(options.out).open("w", encoding="utf-8") as file:
         for engine in options.engines:
@@ -87,8 +80,13 @@ def main(arguments: list[str]) -> int:
                 rows.append(measure(engine, worlds, options.overrides))
                 file.write(json.dumps(rows[-1]) + "\n")
                 file.flush()
-    Console(width=150).print(table_of(rows))
+    console.print(table_of(rows))
     return 0
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the script; returns its exit status."""
+    return run_script(report, arguments, __doc__)
 
 
 if __name__ == "__main__":

@@ -15,8 +15,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from rich.console import Console
+
 from hdmi.build import ConfigError, Task, make_task
-from hdmi.cli import USER_ERRORS
+from hdmi.cli import run_script
 from hdmi.evaluation import RenderingError
 from hdmi.evaluation.agents import AGENTS, BlindAgent, task_config
 from hdmi.evaluation.options import parse_options
@@ -75,26 +77,25 @@ def prepare(options: Options) -> tuple[Task, Iterator[Moment], Path]:
     return task, moments, Path(options.out or out)
 
 
+def play(arguments: list[str], console: Console) -> int:
+    """Opens the window, or writes the video."""
+    del console
+    options = parse_options(Options, arguments)
+    task, moments, out = prepare(options)
+    control_dt = task.scene.sim.control_dt
+    overlay = Overlay(task, ghost=options.agent != "reference")
+    if options.window:
+        show(moments, overlay, control_dt)
+        return 0
+    size = (options.height, options.width)
+    fps = 1 / (control_dt * options.stride)
+    print(write_video(out, every(moments, options.stride), overlay, fps, size))
+    return 0
+
+
 def main(arguments: list[str]) -> int:
     """Runs the script; returns its exit status."""
-    if arguments in (["-h"], ["--help"]):
-        print(__doc__)
-        return 0
-    try:
-        options = parse_options(Options, arguments)
-        task, moments, out = prepare(options)
-        control_dt = task.scene.sim.control_dt
-        overlay = Overlay(task, ghost=options.agent != "reference")
-        if options.window:
-            show(moments, overlay, control_dt)
-            return 0
-        size = (options.height, options.width)
-        fps = 1 / (control_dt * options.stride)
-        print(write_video(out, every(moments, options.stride), overlay, fps, size))
-    except (*USER_ERRORS, RenderingError, OSError) as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_script(play, arguments, __doc__, errors=(RenderingError,))
 
 
 if __name__ == "__main__":

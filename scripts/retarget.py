@@ -1,12 +1,13 @@
 """Makes a reference of the robot from a person's motion, with inverse kinematics (extra `retarget`).
 
     python scripts/retarget.py source=PATH out=FOLDER [format=FORMAT] [object=TASK] [height=1.75] [source_fps=30]
-        [fps=50] [scale=0.72] [cutoff=6] [body_model=PATH] [self_collision=true] [name=NAME]
+        [fps=50] [scale=0.72] [cutoff=6] [body_model=PATH] [unit=0.01] [up=y] [self_collision=true] [name=NAME]
 
 Formats: `gvhmr` (hmr4d_results.pt; needs source_fps, the video's), `amass` (npz), `omomo` (npz), `intermimic` (pt),
-`bvh`; guessed from the file's name if not given. `object` is the task that describes the object of the motion (and
-the end effectors, whose contact labels the source may have). Lengths of the scene are scaled so that the person's legs
-become as long as the robot's, unless `scale` says otherwise; `height` is the person's, if the file does not tell.
+`bvh` (centimetres and y up unless `unit`, in metres, and `up` say otherwise); guessed from the file if not given.
+`object` is the task that describes the object of the motion, and the end effectors, whose contact labels the source may
+have. Lengths of the scene are scaled so that the person's legs become as long as the robot's, unless `scale` says
+otherwise; `height` is the person's, if the file does not tell. What is faster than `cutoff` Hz is taken for noise.
 
 The reference is written to FOLDER (motion.npz, meta.json), with a report beside it (retarget.json). The exit status is
 0, 1 if frames could not be solved (they are in the report), 2 for wrong arguments or files.
@@ -23,7 +24,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from hdmi.build import ConfigError, scene_parts
-from hdmi.cli import USER_ERRORS
+from hdmi.cli import run_script
 from hdmi.evaluation.agents import task_config
 from hdmi.evaluation.options import parse_options
 from hdmi.motion import save_motion
@@ -45,6 +46,8 @@ class Options:
     height: float | None = None
     source_fps: float | None = None
     body_model: str | None = None
+    unit: float | None = None
+    up: str | None = None
     fps: float = 50.0
     scale: float | None = None
     cutoff: float = 6.0
@@ -55,8 +58,17 @@ def run(options: Options, console: Console) -> tuple[Path, RetargetReport]:
     """Reads, retargets and writes; returns the folder and the report."""
     if options.source is None or options.out is None:
         raise ConfigError("give source=PATH and out=FOLDER")
+    for key in ("fps", "cutoff", "scale"):
+        if (value := getattr(options, key)) is not None and not value > 0:
+            raise ConfigError(f"{key}: expected more than 0, got {value:g}")
     human = read_person(
-        options.source, options.format, fps=options.source_fps, height=options.height, body_model=options.body_model
+        options.source,
+        options.format,
+        source_fps=options.source_fps,
+        height=options.height,
+        body_model=options.body_model,
+        unit=options.unit,
+        up=options.up,
     )
     human = replace(human, name=options.name or Path(options.out).name)
     parts: dict[str, Any] = {} if options.object is None else scene_parts(task_config(options.object))
@@ -81,20 +93,17 @@ def run(options: Options, console: Console) -> tuple[Path, RetargetReport]:
     return folder, report
 
 
-def main(arguments: list[str]) -> int:
-    """Runs the script; returns its exit status."""
-    if arguments in (["-h"], ["--help"]):
-        print(__doc__)
-        return 0
-    console = Console() if sys.stdout.isatty() else Console(width=120)
-    try:
-        folder, report = run(parse_options(Options, arguments), console)
-    except (*USER_ERRORS, ImportError, OSError) as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 2
+def show(arguments: list[str], console: Console) -> int:
+    """Retargets, and shows the report."""
+    folder, report = run(parse_options(Options, arguments), console)
     console.print(report.table())
     print(folder)
     return 1 if report.solver_failures else 0
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the script; returns its exit status."""
+    return run_script(show, arguments, __doc__)
 
 
 if __name__ == "__main__":

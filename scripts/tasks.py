@@ -23,8 +23,7 @@ from pathlib import Path
 from rich.console import Console
 
 from hdmi.build import ConfigError, make_task
-from hdmi.cli import USER_ERRORS
-from hdmi.console import make_console
+from hdmi.cli import run_script
 from hdmi.evaluation.agents import task_config, task_names
 from hdmi.evaluation.options import parse_options
 from hdmi.evaluation.tasks import TaskCheck, check_table, check_task, list_tasks, render_reference, sources
@@ -90,28 +89,25 @@ def gallery(names: list[str], options: Options, console: Console) -> int:
     return 0
 
 
+def command(arguments: list[str], console: Console) -> int:
+    """Runs the command that the arguments name, or lists the tasks."""
+    words = [argument for argument in arguments if "=" not in argument]
+    options = parse_options(Options, [argument for argument in arguments if "=" in argument])
+    for key in ("num_envs", "jobs"):
+        if getattr(options, key) < 1:
+            raise ConfigError(f"{key}: expected at least 1, got {getattr(options, key)}")
+    if not words:
+        console.print(list_tasks(options.motion_root))
+        return 0
+    commands = {"check": check, "gallery": gallery}
+    if words[0] not in commands:
+        raise ConfigError(f"there is no command {words[0]!r}; there is {', '.join(commands)}")
+    return commands[words[0]](words[1:], options, console)
+
+
 def main(arguments: list[str]) -> int:
     """Runs the script; returns its exit status."""
-    if arguments in (["-h"], ["--help"]):
-        print(__doc__)
-        return 0
-    console = make_console(200)
-    try:
-        words = [argument for argument in arguments if "=" not in argument]
-        options = parse_options(Options, [argument for argument in arguments if "=" in argument])
-        for key in ("num_envs", "jobs"):
-            if getattr(options, key) < 1:
-                raise ConfigError(f"{key}: expected at least 1, got {getattr(options, key)}")
-        if not words:
-            console.print(list_tasks(options.motion_root))
-            return 0
-        commands = {"check": check, "gallery": gallery}
-        if words[0] not in commands:
-            raise ConfigError(f"there is no command {words[0]!r}; there is {', '.join(commands)}")
-        return commands[words[0]](words[1:], options, console)
-    except (*USER_ERRORS, RuntimeError, OSError) as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 2
+    return run_script(command, arguments, __doc__, width=200, errors=(RuntimeError,))
 
 
 if __name__ == "__main__":

@@ -15,10 +15,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from hdmi.build import ConfigError, scene_parts
-from hdmi.cli import USER_ERRORS
+from hdmi.build import scene_parts
+from hdmi.cli import run_script
 from hdmi.evaluation.agents import CONF, task_config
-from hdmi.evaluation.options import parse_options
+from hdmi.evaluation.options import parse_motion_options
 from hdmi.motion import MotionError, load_motion
 from hdmi.motion.validate import Report, unreadable, validate_motion
 
@@ -43,26 +43,20 @@ def report_on(path: Path, task: str | None) -> Report:
     return validate_motion(motion, **parts)
 
 
-def main(arguments: list[str]) -> int:
-    """Runs the script; returns its exit status."""
-    if arguments in (["-h"], ["--help"]):
-        print(__doc__)
-        return 0
-    as_json = "--json" in arguments
-    paths = [argument for argument in arguments if argument != "--json" and "=" not in argument]
-    try:
-        if len(paths) != 1:
-            raise ConfigError(f"give one motion folder, got {paths or 'none'}")
-        options = parse_options(Options, [argument for argument in arguments if "=" in argument])
-        report = report_on(Path(paths[0]), options.task)
-    except (*USER_ERRORS, OSError) as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 2
-    if as_json:
+def validate(arguments: list[str], console: Console) -> int:
+    """Shows the report on a motion."""
+    path, options = parse_motion_options(Options, [argument for argument in arguments if argument != "--json"])
+    report = report_on(path, options.task)
+    if "--json" in arguments:
         print(report.to_json())
     else:
-        report.print(Console() if sys.stdout.isatty() else Console(width=150))
+        report.print(console)
     return 0 if report.verdict != "bad" else 1
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the script; returns its exit status."""
+    return run_script(validate, arguments, __doc__)
 
 
 if __name__ == "__main__":

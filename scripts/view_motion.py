@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from rich.console import Console
 
 from hdmi.build import ConfigError, Task
-from hdmi.cli import USER_ERRORS
+from hdmi.cli import run_script
 from hdmi.evaluation import RenderingError
-from hdmi.evaluation.options import parse_options
+from hdmi.evaluation.options import parse_motion_options
 from hdmi.evaluation.reference_view import load_view
 from hdmi.evaluation.video import Overlay, every, replay, write_video
 from hdmi.evaluation.viewer import ReferenceViewer
@@ -46,41 +46,38 @@ def as_task(playback: Playback) -> Task:
     return Task(playback.motion.name, playback.scene, playback.reference)
 
 
+def view(arguments: list[str], console: Console) -> int:
+    """Writes the video, or runs the viewer."""
+    path, options = parse_motion_options(Options, arguments)
+    for name in ("stride", "width", "height"):
+        if getattr(options, name) < 1:
+            raise ConfigError(f"{name}: expected at least 1, got {getattr(options, name)}")
+    playback, taken = load_view(path, options.task)
+    last = playback.num_frames - 1
+    if not 0 <= options.start < last:
+        raise ConfigError(f"start: expected a frame from 0 to {last - 1}, got {options.start}")
+    name = playback.motion.name
+    console.print(f"{name}: {last + 1} frames at {playback.fps:g} fps, {taken}", highlight=False, soft_wrap=True)
+    ghost = None if options.ghost is None else load_view(options.ghost, options.task)[0]
+    if options.viewer:
+        viewer = ReferenceViewer(playback, ghost, options.host, options.port)
+        console.print(f"open {viewer.address} (Ctrl+C ends it)", highlight=False, soft_wrap=True)
+        try:
+            viewer.run()
+        except KeyboardInterrupt:
+            viewer.stop()
+        return 0
+    task = as_task(playback)
+    overlay = Overlay(task, ghost=ghost is not None, ghost_task=None if ghost is None else as_task(ghost))
+    moments = every(replay(task, options.start), options.stride)
+    size = (options.height, options.width)
+    print(write_video(options.out or f"{name}.mp4", moments, overlay, playback.fps / options.stride, size))
+    return 0
+
+
 def main(arguments: list[str]) -> int:
     """Runs the script; returns its exit status."""
-    if arguments in ([], ["-h"], ["--help"]):
-        print(__doc__)
-        return 0 if arguments else 2
-    console = Console(highlight=False, soft_wrap=True)
-    try:
-        options = parse_options(Options, arguments[1:])
-        for name in ("stride", "width", "height"):
-            if getattr(options, name) < 1:
-                raise ConfigError(f"{name}: expected at least 1, got {getattr(options, name)}")
-        playback, taken = load_view(arguments[0], options.task)
-        last = playback.num_frames - 1
-        if not 0 <= options.start < last:
-            raise ConfigError(f"start: expected a frame from 0 to {last - 1}, got {options.start}")
-        name = playback.motion.name
-        console.print(f"{name}: {last + 1} frames at {playback.fps:g} fps, {taken}")
-        ghost = None if options.ghost is None else load_view(options.ghost, options.task)[0]
-        if options.viewer:
-            viewer = ReferenceViewer(playback, ghost, options.host, options.port)
-            console.print(f"open {viewer.address} (Ctrl+C ends it)")
-            try:
-                viewer.run()
-            except KeyboardInterrupt:
-                viewer.stop()
-            return 0
-        task = as_task(playback)
-        overlay = Overlay(task, ghost=ghost is not None, ghost_task=None if ghost is None else as_task(ghost))
-        moments = every(replay(task, options.start), options.stride)
-        size = (options.height, options.width)
-        print(write_video(options.out or f"{name}.mp4", moments, overlay, playback.fps / options.stride, size))
-    except (*USER_ERRORS, RenderingError, OSError) as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_script(view, arguments, __doc__, errors=(RenderingError,))
 
 
 if __name__ == "__main__":

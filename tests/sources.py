@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
-from hdmi.motion import SMPL_JOINTS, anthropometric_skeleton
+from hdmi.assets import default_joint_pos
+from hdmi.motion import SMPL_JOINTS, anthropometric_skeleton, forward_kinematics
 from hdmi.motion.skeleton import UPRIGHT
 from hdmi.motion.sources.robot import table_order
 
@@ -105,6 +107,24 @@ def write_intermimic(path: Path) -> Path:
     data[:, 386::4] = 1.0
     torch.save(data, path)
     return path
+
+
+def robot_arrays(num_frames: int = T) -> dict[str, np.ndarray]:
+    """A robot that walks, turns and swings all its joints; table order, float32."""
+    t = np.arange(num_frames) / 50
+    joint_pos = default_joint_pos() + 0.3 * np.sin(t[:, None] * 5 + np.arange(29))
+    root = np.stack([0.5 * t, 0.1 * t, 0.76 + 0 * t], axis=-1)
+    quat = Rotation.from_euler("z", 0.5 * t[:, None]).as_quat(scalar_first=True)
+    pos, body_quat = forward_kinematics(root, quat, joint_pos)
+    rng = np.random.default_rng(0)
+    return {
+        "joint_pos": joint_pos.astype(np.float32),
+        "joint_vel": rng.normal(size=joint_pos.shape).astype(np.float32),
+        "body_pos_w": pos.astype(np.float32),
+        "body_quat_w": body_quat.astype(np.float32),
+        "body_lin_vel_w": rng.normal(size=pos.shape).astype(np.float32),
+        "body_ang_vel_w": rng.normal(size=pos.shape).astype(np.float32),
+    }
 
 
 def write_mjlab_file(path: Path, arrays: dict[str, np.ndarray], order: str) -> Path:

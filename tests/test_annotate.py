@@ -19,6 +19,7 @@ from hdmi.build import scene_parts
 from hdmi.evaluation.agents import task_config
 from hdmi.motion import Motion, MotionError, find_motion, load_motion, save_motion
 from hdmi.motion.annotate import (
+    ContactCriteria,
     Interval,
     Overrides,
     Surface,
@@ -31,6 +32,7 @@ from hdmi.motion.annotate import (
     load_overrides,
     object_surfaces,
 )
+from hdmi.motion.annotate.contacts import _label
 
 QUARTER = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # about z
 LEFT, RIGHT = "left_wrist_yaw_link", "right_wrist_yaw_link"
@@ -228,6 +230,49 @@ class TestOverrides:
             load_overrides(tmp_path / "annotation.yaml")
 
 
+class TestCriteria:
+    """Labels from gaps, speeds of the object and speeds of the effector in its frame, made by hand at 50 fps."""
+
+    T = 300
+
+    def label(
+        self, gap: np.ndarray | float, speed: np.ndarray | float = 0.1, relative: float = 0.09, fixed: bool = False
+    ) -> list[tuple[int, int]]:
+        gap, speed, relative = (np.broadcast_to(value, self.T).astype(float) for value in (gap, speed, relative))
+        return intervals(_label(gap, speed, relative, fixed, 50.0, ContactCriteria()))
+
+    def within(self, spans: dict[tuple[int, int], float], otherwise: float) -> np.ndarray:
+        out = np.full(self.T, otherwise)
+        for (first, last), value in spans.items():
+            out[first : last + 1] = value
+        return out
+
+    def test_begins_nearer_than_it_ends(self):
+        assert self.label(self.within({(60, 89): 0.035, (90, 129): 0.02, (130, 159): 0.035}, 0.06)) == [(90, 159)]
+        assert self.label(self.within({(60, 159): 0.035}, 0.06)) == []
+
+    def test_what_slides_past_is_no_contact(self):
+        assert self.label(0.01, speed=0.1, relative=0.19) == [(0, 299)]
+        assert self.label(0.01, speed=0.1, relative=0.21) == []
+        assert self.label(0.01, speed=0.06, relative=0.099) == [(0, 299)]  # slow enough in itself
+
+    def test_what_moves_along_is_held_from_further_away(self):
+        assert self.label(0.08, speed=self.within({(100, 199): 0.2}, 0.0), relative=0.09) == [(100, 199)]
+        assert self.label(0.08, speed=0.2, relative=0.11) == []
+        assert self.label(0.11, speed=0.2, relative=0.0) == []
+
+    def test_short_pauses_are_bridged_and_short_contacts_dropped(self):
+        near = {(50, 99): 0.01, (115, 160): 0.01, (200, 210): 0.01}
+        assert self.label(self.within(near, 0.06)) == [(50, 160)]
+        assert self.label(self.within({(50, 99): 0.01, (120, 160): 0.01}, 0.06)) == [(50, 99), (120, 160)]
+
+    def test_counts_around_the_objects_motion_only_unless_it_is_fixed(self):
+        moving = self.within({(100, 119): 0.1}, 0.0)
+        assert self.label(0.01, moving) == [(50, 169)]  # a second before and after
+        assert self.label(0.01, 0.0) == []
+        assert self.label(self.within({(20, 80): 0.01}, 0.06), 0.0, fixed=True) == [(20, 80)]
+
+
 class TestContacts:
     def test_labels_are_found_again(self, lift_box):
         motion, scene = lift_box
@@ -256,6 +301,17 @@ class TestContacts:
         pos[:, box] = pos[0, box]
         found = annotate_motion(replace(motion, body_pos_w=pos), **scene)
         assert not found.object_contact.any()
+
+    def test_objects_that_cannot_move_are_touched_where_hands_are_near(self, lift_box):
+        motion, scene = lift_box
+        still = {key: getattr(motion, key).copy() for key in ("body_pos_w", "joint_pos", "body_quat_w")}
+        for value in still.values():
+            value[100:] = value[100]  # at frame 100 the box is held, still on its way up
+        fixed = replace(scene["object"], fixed_base=True)
+        found = annotate_motion(replace(motion, **still), **{**scene, "object": fixed})
+        ((first, last),) = intervals(found.object_contact[:, 0])
+        assert 60 < first < 100
+        assert last == motion.num_frames - 1
 
     def test_a_person_has_the_last_word(self, lift_box):
         motion, scene = lift_box

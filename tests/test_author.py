@@ -273,7 +273,7 @@ class TestMotions:
 
     def test_it_is_near_its_plan(self, authored):
         assert authored.unsettled == 0
-        assert max(miss for name, miss in authored.misses.items() if name != "com") < 0.005
+        assert max(miss for name, miss in authored.misses.items() if name != "centre of mass") < 0.005
         assert authored.speed < 0.7
         assert authored.pressure_error < 0.02
 

@@ -272,6 +272,15 @@ class TestReference:
         # hung from the pelvis, which does not turn
         np.testing.assert_allclose(reference.body_ang_vel[:, foot], np.zeros((T, 3)), atol=1e-3)
 
+    def test_linear_velocities_are_of_origins_whatever_the_file_has(self, write_motion):
+        fast = np.full((T, 4, 3), 7.0, np.float32)  # as of centres of mass, which turning bodies swing about
+        for control_dt in (0.02, 0.01):
+            folder = write_motion(f"stroll_{control_dt}", body_lin_vel_w=fast)
+            reference = make_reference(folder, control_dt=control_dt, object=BOX)
+            count = reference.num_frames
+            np.testing.assert_allclose(reference.body_lin_vel[:, 0], [[0.5, 0, 0]] * count, atol=1e-4)
+            np.testing.assert_allclose(reference.object_lin_vel, [[0, 0.2, 0]] * count, atol=1e-4)
+
     def test_bodies_that_the_motion_has_are_kept(self, write_motion, motion_arrays):
         moved = changed(motion_arrays["body_pos_w"], (slice(None), 2, 2), 1.5)
         reference = make_reference(write_motion(body_pos_w=moved), control_dt=0.02)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import people
 import pytest
+from mocks import load_script
 from scipy.spatial.transform import Rotation
 from sources import write_gvhmr
 
@@ -19,7 +19,14 @@ from hdmi.motion import HumanMotion, Motion, MotionError, ObjectTrajectory, load
 from hdmi.motion.retarget import RetargetOptions, RetargetReport, retarget
 from hdmi.motion.retarget.body import find_scaling, read_body, robot_measures
 from hdmi.motion.retarget.feet import find_stances
-from hdmi.motion.retarget.interaction import lowest_point, object_poses, obstacles, on_object, scale_object
+from hdmi.motion.retarget.interaction import (
+    handled_point,
+    lowest_point,
+    object_poses,
+    obstacles,
+    on_object,
+    scale_object,
+)
 
 pytest.importorskip("mink")
 
@@ -158,7 +165,25 @@ class TestReach:
     def test_report_is_written(self, result: tuple[Motion, RetargetReport], tmp_path: Path):
         report = json.loads(result[1].save(tmp_path / "retarget.json").read_text())
         assert report["frames"] == self.human.num_frames
+        assert report["height"] == people.HEIGHT
         assert report["residuals"]["left toes planted"]["p99"] < 1e-3
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+def test_a_foot_on_its_toes_keeps_its_heading(yaw: float):
+    """The shank of a kneeling person is tilted back until the foot stands on its tips, and further."""
+    human = people.squat()
+    phase = people.ease(np.linspace(-0.5, 1.2, human.num_frames))
+    tilt, pitch = 1.4 * phase, np.radians(150) * phase
+    pos = human.joint_pos.copy()
+    knee = pos[:, human.index("left_knee")] = np.array([0.1, 0.09, 0.5])
+    ankle = knee + 0.4 * np.column_stack([-np.sin(tilt), 0 * tilt, -np.cos(tilt)])
+    pos[:, human.index("left_ankle")] = ankle
+    pos[:, human.index("left_foot")] = ankle + 0.14 * np.column_stack([np.cos(pitch), 0 * pitch, -np.sin(pitch)])
+    turned = Rotation.from_euler("z", yaw).apply(pos.reshape(-1, 3)).reshape(pos.shape)
+    body = read_body(replace(human, joint_pos=turned, joint_quat=None), cutoff=25.0)
+    np.testing.assert_allclose(body.foot_yaw["left"], yaw, atol=1e-3)
+    np.testing.assert_allclose(body.foot_pitch["left"], pitch - pitch[0], atol=1e-3)
 
 
 class TestObject:
@@ -170,6 +195,19 @@ class TestObject:
         np.testing.assert_allclose(scaled.pos[0], [0.5, 1.0, 0.1], atol=1e-5)  # 0.1 is half its height
         np.testing.assert_allclose(scaled.pos[1], [0.75, 1.0, 0.6], atol=1e-5)
         np.testing.assert_allclose(scale_object(source, 0.5, None).pos, scaled.pos, atol=1e-5)
+
+    def test_grows_away_from_the_hands_that_push_it(self):
+        source = ObjectTrajectory("box", np.tile([2.0, 0.0, 0.1], (50, 1)), np.tile([1.0, 0, 0, 0], (50, 1)))
+        approach = np.minimum(np.linspace(0.5, 2.0, 50), 1.83)  # 2 cm from the face at 1.85
+        left, right = (np.column_stack([approach, np.full(50, y), np.full(50, 0.1)]) for y in (0.1, -0.1))
+        anchor = handled_point([left, right], BOX, source)
+        np.testing.assert_allclose(anchor, [-0.15, 0.0, 0.0], atol=1e-3)
+        scaled = scale_object(source, 0.5, BOX, anchor)
+        np.testing.assert_allclose(scaled.pos[0], [1.85 / 2 + 0.15, 0.0, 0.1], atol=1e-3)
+        # one hand counts if the other stays away; none, if both do
+        away = left + np.array([0.0, 2.0, 0.0])
+        np.testing.assert_allclose(handled_point([left, away], BOX, source), [-0.15, 0.1, 0.0], atol=1e-3)
+        np.testing.assert_allclose(handled_point([away, away], BOX, source), 0.0)
 
     @pytest.mark.parametrize(
         ("geom", "heights"),
@@ -282,34 +320,32 @@ def as_person(motion: Motion) -> HumanMotion:
     return HumanMotion(motion.name, motion.fps, 1.3, tuple(points), np.stack(list(points.values()), axis=1))
 
 
-def test_the_robots_own_walk_comes_back(public_motions: Path):
-    motion = load_motion(public_motions / "walk")
+@pytest.mark.parametrize(("name", "frames"), [("walk", slice(200)), ("move_suitcase", slice(60, 240))])
+def test_the_robots_own_walk_and_kneel_come_back(public_motions: Path, name: str, frames: slice):
+    motion = load_motion(public_motions / name)
     motion = replace(
         motion,
-        **{key: value[:200] for key, value in vars(motion).items() if isinstance(value, np.ndarray)},
+        **{key: value[frames] for key, value in vars(motion).items() if isinstance(value, np.ndarray)},
     )
     found, report = retarget(as_person(motion), options=RetargetOptions(cutoff=25.0))
     assert report.solver_failures == []
     assert report.scale == pytest.approx(1.0, abs=0.01)
     known = [name for name in motion.joint_names if name in g1.JOINT_NAMES and "wrist" not in name]
-    error = np.degrees([np.abs(joint(found, name) - joint(motion, name)).mean() for name in known])
-    assert error.mean() < 5
+    error = np.degrees([np.abs(joint(found, name) - joint(motion, name)) for name in known])
+    assert error.mean() < 6
+    assert error.max() < 40
 
 
-ROOT = Path(__file__).parents[1]
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    return load_script("retarget")
 
 
 class TestScript:
-    @staticmethod
-    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, str(ROOT / "scripts" / "retarget.py"), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, timeout=200)
-
-    def test_from_a_file_to_a_motion_and_a_report(self, tmp_path: Path):
+    def test_from_a_file_to_a_motion_and_a_report(self, script, tmp_path, capsys):
         source, out = write_gvhmr(tmp_path / "hmr4d_results.pt"), tmp_path / "wave"
-        done = self.run(f"source={source}", "source_fps=30", "height=1.8", f"out={out}")
-        assert done.returncode == 0, done.stderr
-        assert str(out) in done.stdout
+        assert script.main([f"source={source}", "source_fps=30", "height=1.8", f"out={out}"]) == 0
+        assert str(out) in capsys.readouterr().out
         assert load_motion(out).fps == 50.0
         assert json.loads((out / "retarget.json").read_text())["name"] == "wave"
 
@@ -318,13 +354,14 @@ class TestScript:
         [
             (["out=x"], "give source=PATH and out=FOLDER"),
             (["source=none.bvh", "out=x"], "none.bvh: no such file"),
-            (["source=hmr4d_results.pt", "out=x"], "how fast the video is"),
+            (["source=hmr4d_results.pt", "out=x"], "how fast the video is: give source_fps"),
             (["source=x.csv", "out=x"], "say which format"),
             (["source=none.bvh", "out=x", "format=fbx"], "there is no format 'fbx'"),
+            (["source=none.bvh", "out=x", "source_fps=30"], "bvh takes no source_fps; it takes height, unit, up"),
+            (["source=none.bvh", "out=x", "up=x"], "up: the axis that points up is y or z, got 'x'"),
+            (["source=none.bvh", "out=x", "cutoff=0"], "cutoff: expected more than 0, got 0"),
         ],
     )
-    def test_wrong_arguments_say_what_is_wrong(self, arguments: list[str], message: str, tmp_path: Path):
-        done = self.run(*arguments)
-        assert done.returncode == 2
-        assert message in done.stderr
-        assert "Traceback" not in done.stderr
+    def test_wrong_arguments_say_what_is_wrong(self, script, arguments, message, capsys):
+        assert script.main(arguments) == 2
+        assert message in capsys.readouterr().err

@@ -10,10 +10,19 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from sources import T, write_amass, write_bvh, write_gvhmr, write_intermimic, write_mjlab_file, write_omomo
+from sources import (
+    T,
+    robot_arrays,
+    write_amass,
+    write_bvh,
+    write_gvhmr,
+    write_intermimic,
+    write_mjlab_file,
+    write_omomo,
+)
 
-from hdmi.assets import default_joint_pos, g1
-from hdmi.motion import SMPL_JOINTS, MotionError, anthropometric_skeleton, forward_kinematics, load_motion, save_motion
+from hdmi.assets import g1
+from hdmi.motion import SMPL_JOINTS, MotionError, anthropometric_skeleton, load_motion, save_motion
 from hdmi.motion.skeleton import UPRIGHT
 from hdmi.motion.sources import (
     convert,
@@ -25,6 +34,7 @@ from hdmi.motion.sources import (
     read_intermimic,
     read_mjlab,
     read_omomo,
+    read_person,
     read_robot_csv,
     write_holosoma,
     write_mjlab,
@@ -256,22 +266,30 @@ class TestBvh:
         assert str(path) in str(caught.value)
 
 
-def robot_arrays(num_frames: int = T) -> dict[str, np.ndarray]:
-    """A robot that walks, turns and swings all its joints; table order, float32."""
-    t = np.arange(num_frames) / 50
-    joint_pos = default_joint_pos() + 0.3 * np.sin(t[:, None] * 5 + np.arange(29))
-    root = np.stack([0.5 * t, 0.1 * t, 0.76 + 0 * t], axis=-1)
-    quat = Rotation.from_euler("z", 0.5 * t[:, None]).as_quat(scalar_first=True)
-    pos, body_quat = forward_kinematics(root, quat, joint_pos)
-    rng = np.random.default_rng(0)
-    return {
-        "joint_pos": joint_pos.astype(np.float32),
-        "joint_vel": rng.normal(size=joint_pos.shape).astype(np.float32),
-        "body_pos_w": pos.astype(np.float32),
-        "body_quat_w": body_quat.astype(np.float32),
-        "body_lin_vel_w": rng.normal(size=pos.shape).astype(np.float32),
-        "body_ang_vel_w": rng.normal(size=pos.shape).astype(np.float32),
-    }
+class TestPerson:
+    """The format of a file is found in the file; what it does not say has to be given, what it says cannot be."""
+
+    def test_formats_are_found(self, tmp_path: Path) -> None:
+        renamed = read_person(write_gvhmr(tmp_path / "results.pt"), source_fps=25.0)
+        assert (renamed.fps, renamed.object) == (25.0, None)
+        assert read_person(write_intermimic(tmp_path / "sub1_box_0.pt")).contact is not None
+        assert read_person(write_omomo(tmp_path / "a.npz")).object is not None
+        assert read_person(write_amass(tmp_path / "b.npz", "smplh")).fps == 120.0
+        assert read_person(write_bvh(tmp_path / "a.bvh")).height == pytest.approx(1.75, abs=0.01)
+
+    def test_options_reach_the_reader(self, tmp_path: Path) -> None:
+        path = write_bvh(tmp_path / "a.bvh")
+        metres = read_person(path, unit=0.012, up="z", height=1.5)
+        assert metres.height == 1.5
+        np.testing.assert_allclose(metres.pos("pelvis")[0], [1.2, 1.08, 2.4], atol=1e-5)
+
+    def test_what_does_not_fit_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(MotionError, match="give source_fps"):
+            read_person(write_gvhmr(tmp_path / "results.pt"))
+        with pytest.raises(MotionError, match="amass takes no source_fps; it takes height, body_model"):
+            read_person(write_amass(tmp_path / "b.npz", "smplh"), source_fps=60.0)
+        with pytest.raises(MotionError, match="omomo takes no height; it takes nothing"):
+            read_person(write_omomo(tmp_path / "a.npz"), height=1.7)
 
 
 class TestMjlab:

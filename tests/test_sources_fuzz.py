@@ -15,31 +15,16 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sources import write_amass, write_bvh, write_gvhmr, write_intermimic, write_omomo
+from sources import robot_arrays, write_amass, write_bvh, write_gvhmr, write_intermimic, write_omomo
 
+import hdmi.motion.sources as readers
+from hdmi.assets import g1
 from hdmi.motion import HumanMotion, Motion, MotionError, load_motion, save_motion
-from hdmi.motion.sources import (
-    read_amass,
-    read_bvh,
-    read_gvhmr,
-    read_holosoma,
-    read_intermimic,
-    read_mjlab,
-    read_omomo,
-    read_robot_csv,
-    write_holosoma,
-    write_mjlab,
-    write_robot_csv,
-)
 
 FEW = settings(max_examples=25)
 
 
 def _motion() -> Motion:
-    from test_sources import robot_arrays
-
-    from hdmi.assets import g1
-
     arrays = robot_arrays()
     thing = {key: value[:, :1] for key, value in arrays.items() if key.startswith("body")}
     arrays |= {key: np.concatenate([arrays[key], value], axis=1) for key, value in thing.items()}
@@ -49,15 +34,15 @@ def _motion() -> Motion:
 Write = Callable[[Path], Any]
 Read = Callable[[Path], Motion | HumanMotion]
 READERS: dict[str, tuple[str, Write, Read]] = {
-    "gvhmr": ("a.pt", write_gvhmr, lambda path: read_gvhmr(path, 30.0)),
-    "amass_smplh": ("a.npz", lambda path: write_amass(path, "smplh"), read_amass),
-    "amass_smplx": ("a.npz", lambda path: write_amass(path, "smplx"), read_amass),
-    "omomo": ("a.npz", write_omomo, read_omomo),
-    "intermimic": ("a_box_0.pt", write_intermimic, read_intermimic),
-    "bvh": ("a.bvh", write_bvh, read_bvh),
-    "mjlab": ("a.npz", lambda path: write_mjlab(_motion(), path), read_mjlab),
-    "holosoma": ("a.npz", lambda path: write_holosoma(_motion(), path), read_holosoma),
-    "csv": ("a.csv", lambda path: write_robot_csv(_motion(), path), read_robot_csv),
+    "gvhmr": ("a.pt", write_gvhmr, lambda path: readers.read_gvhmr(path, 30.0)),
+    "amass_smplh": ("a.npz", lambda path: write_amass(path, "smplh"), readers.read_amass),
+    "amass_smplx": ("a.npz", lambda path: write_amass(path, "smplx"), readers.read_amass),
+    "omomo": ("a.npz", write_omomo, readers.read_omomo),
+    "intermimic": ("a_box_0.pt", write_intermimic, readers.read_intermimic),
+    "bvh": ("a.bvh", write_bvh, readers.read_bvh),
+    "mjlab": ("a.npz", lambda path: readers.write_mjlab(_motion(), path), readers.read_mjlab),
+    "holosoma": ("a.npz", lambda path: readers.write_holosoma(_motion(), path), readers.read_holosoma),
+    "csv": ("a.csv", lambda path: readers.write_robot_csv(_motion(), path), readers.read_robot_csv),
     "hdmi": ("motion.npz", lambda path: save_motion(_motion(), path.parent), lambda path: load_motion(path.parent)),
 }
 every_reader = pytest.mark.parametrize("name", READERS)
@@ -294,4 +279,4 @@ def test_an_archive_that_unpacks_to_more_than_fits_is_refused(tmp_path: Path, mo
     monkeypatch.setattr("hdmi.motion.files.MAX_BYTES", 100_000)
     np.savez_compressed(tmp_path / "a.npz", trans=np.zeros((10_000, 3)), poses=np.zeros(1), other=np.zeros(10**6))
     with pytest.raises(MotionError, match="GiB of data"):
-        read_amass(tmp_path / "a.npz")
+        readers.read_amass(tmp_path / "a.npz")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import runpy
 import subprocess
 import sys
@@ -316,22 +317,24 @@ def test_picture_is_taken_at_mid_contact(motions, tmp_path):
 
 
 class TestFifteenth:
-    """The example of docs/tasks.md, as it stands there, with a mesh and a motion."""
+    """The examples of docs/tasks.md and docs/tutorial.md, as they stand there, with a mesh and a motion."""
 
-    def config(self, tmp_path: Path) -> DictConfig:
-        text = (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8")
-        block = text.split("```yaml\n# conf/task/carry_vase.yaml\n")[1].split("```")[0]
-        mesh = tmp_path / "vase.obj"
+    def config(self, tmp_path: Path, page: str = "tasks.md", name: str = "carry_vase") -> DictConfig:
+        text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+        block = next(block for block in text.split("# @package")[1:] if f"name: {name}\n" in block).split("```")[0]
+        mesh = tmp_path / "mesh.obj"
         trimesh.creation.capsule(height=20.0, radius=8.0).export(mesh)
-        assert "/path/to/vase.obj" in block
+        block, count = re.subn(r"/path/to/\w+\.obj", str(mesh), block)
+        assert count == 1
         (tmp_path / "task").mkdir()
-        (tmp_path / "task" / "carry_vase.yaml").write_text(block.replace("/path/to/vase.obj", str(mesh)))
-        cfg = load_config(f"hydra.searchpath=[file://{tmp_path}]", "task=carry_vase", f"motion_root={tmp_path}")
-        save_motion(standing_motion(cfg), tmp_path / "carry_vase")
+        (tmp_path / "task" / f"{name}.yaml").write_text(f"# @package{block}")
+        cfg = load_config(f"hydra.searchpath=[file://{tmp_path}]", f"task={name}", f"motion_root={tmp_path}")
+        save_motion(standing_motion(cfg), tmp_path / name)
         return cfg
 
-    def test_steps(self, tmp_path):
-        cfg = self.config(tmp_path)
+    @pytest.mark.parametrize(("page", "name"), [("tasks.md", "carry_vase"), ("tutorial.md", "press_crate")])
+    def test_steps(self, tmp_path, page, name):
+        cfg = self.config(tmp_path, page, name)
         env = make_env(cfg, 2)
         assert env.rollout(3, break_when_any_done=False)["next", "policy"].isfinite().all()
         geoms = env.base_env.scene.object_geoms

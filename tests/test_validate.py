@@ -117,6 +117,14 @@ class TestRobot:
         ((first, last),) = spans(finding)
         assert (first, last) in ((20, 39), (20, 40), (21, 39))  # half the speed at either end
 
+    def test_a_foot_may_slide_while_it_lands(self):
+        def slides(last: int) -> list[tuple[int, int]]:
+            x = np.clip(np.arange(T) - 20, 0, last - 20) / FPS * 0.4
+            return spans(validate_motion(moved(x=x, z=within(18, 29, 0.03)))["foot_slide"])
+
+        assert slides(30) == []
+        assert slides(36) == [(32, 36)]  # lands at 30, and has two frames
+
     def test_jump(self):
         report = validate_motion(moved(x=within(30, 59, 0.2)))
         assert report.verdict == "bad"
@@ -139,6 +147,10 @@ class TestRobot:
         assert (report["joint_limit"].verdict, spans(report["joint_limit"])) == ("bad", [(20, 29)])
         assert report["joint_velocity"].value == pytest.approx(0.9 * FPS / 2 / 20, rel=1e-3)
         assert report["joint_velocity"].faults[0].part == "left_knee_joint"
+        high = g1.JOINT_RANGES[g1.JOINT_NAMES.index("left_elbow_joint")][1]
+        bent = validate_motion(moved(joints={"left_elbow_joint": high + 0.03}))["joint_limit"]
+        assert bent.value == pytest.approx(0.03, abs=1e-4)
+        assert bent.verdict == "usable"
 
     def test_missing_joints(self):
         kept = [name for name in g1.JOINT_NAMES if "elbow" not in name and "shoulder" not in name]
@@ -313,6 +325,17 @@ class TestJudge:
         assert self.judge([0.0] * 19 + [9.0]).verdict == "good"
         assert self.judge([0.0] * 17 + [1.5] * 3).verdict == "usable"
         assert self.judge([0.0] * 17 + [9.0] * 3).verdict == "bad"
+
+    def test_bounds_themselves_are_allowed(self):
+        assert self.judge([1.0] * 9).verdict == "good"
+        assert self.judge([2.0] * 9).verdict == "usable"
+
+    def test_reasons_say_what_bound_and_where_it_is_worst(self):
+        values = np.array([[0.0, 1.2], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [1.7, 0.0], [1.5, 1.6]])
+        finding = judge("check", Series(values, ["knee", "toe"]), self.LIMIT)
+        assert finding.reason() == "check 1.7 m, above 1: knee, frames 0, 4-5"
+        worse = judge("check", Series(2 * values, ["knee", "toe"]), self.LIMIT)
+        assert worse.reason() == "check 3.4 m, above 2: knee, frames 0, 4-5"
 
     def test_frames_to_which_it_does_not_apply(self):
         nan = float("nan")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
+from pathlib import Path
 from typing import Any, TypeVar
 
 from omegaconf import OmegaConf
@@ -32,6 +33,18 @@ def parse_options(cls: type[T], arguments: Sequence[str]) -> T:
         return OmegaConf.to_object(options)  # type: ignore[return-value]
     except OmegaConfBaseException as error:
         raise ConfigError(f"{error.full_key}: {str(error).splitlines()[0]}") from error
+
+
+def parse_motion_options(cls: type[T], arguments: Sequence[str]) -> tuple[Path, T]:
+    """The motion's folder, which is the one argument without `=`, and the options.
+
+    Raises:
+        ConfigError: without such an argument, with several, and as `parse_options`.
+    """
+    paths = [argument for argument in arguments if "=" not in argument]
+    if len(paths) != 1:
+        raise ConfigError(f"give one motion folder, got {', '.join(paths) or 'none'}")
+    return Path(paths[0]), parse_options(cls, [argument for argument in arguments if "=" in argument])
 
 
 def parse_terminations(value: Any) -> list[str] | None:

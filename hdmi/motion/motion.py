@@ -8,11 +8,14 @@ motion.npz, float32, world frame, quaternions wxyz:
 | body_pos_w         | [T, B, 3] | m, required                                                  |
 | body_quat_w        | [T, B, 4] | required                                                     |
 | joint_pos          | [T, J]    | rad, required                                                |
-| body_lin_vel_w     | [T, B, 3] | m/s; re-derived when absent                                  |
+| body_lin_vel_w     | [T, B, 3] | m/s; re-derived when absent, and for training always         |
 | body_ang_vel_w     | [T, B, 3] | rad/s; re-derived when absent                                |
 | joint_vel          | [T, J]    | rad/s; re-derived when absent                                |
 | object_contact     | [T, E]    | intended contact, bool or 0/1; one column serves all effectors |
 | contact_points     | [T, E, 3] | in the frame of the object's link, m; the task's when absent |
+
+Nothing says whether `body_lin_vel_w` is of the bodies' origins or of their centres of mass, as in the public motions
+and whatever else Isaac wrote: files keep what they have, `make_reference` takes differences of positions.
 """
 
 from __future__ import annotations

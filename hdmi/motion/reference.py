@@ -40,7 +40,7 @@ class Reference:
     joint_vel: Tensor  # [T, 29]
     body_pos: Tensor  # [T, B, 3]
     body_quat: Tensor  # [T, B, 4]
-    body_lin_vel: Tensor  # [T, B, 3]
+    body_lin_vel: Tensor  # [T, B, 3] of the bodies' origins
     body_ang_vel: Tensor  # [T, B, 3]
     object_pos: Tensor  # [T, 3] or [T, 0]
     object_quat: Tensor  # [T, 4] or [T, 0]
@@ -94,7 +94,8 @@ def make_reference(
     """Completes a motion to a reference: table order, control rate, all joints and bodies.
 
     Joints that the motion lacks hold the default pose; bodies that it lacks come from forward kinematics. The
-    object's name and hinge, the scenery and the effectors are the task's.
+    object's name and hinge, the scenery and the effectors are the task's. Linear velocities are differences of
+    positions: the simulator's are of the bodies' origins, those in files often of their centres of mass.
 
     Raises:
         MotionError: if the motion has joints or bodies that nothing knows, lacks the pelvis, the object, its
@@ -106,6 +107,7 @@ def make_reference(
     unknown = [name for name in motion.joint_names if name not in (*g1.JOINT_NAMES, _ROOT_JOINT, hinge)]
     if unknown:
         raise MotionError(f"{where}: joint_names: {unknown} are neither the robot's nor the object's hinge ({hinge!r})")
+    motion = replace(motion, body_lin_vel_w=derivative(motion.body_pos_w, motion.fps))
     motion = complete_robot(resample(motion, 1.0 / control_dt))
     num_frames = motion.num_frames
     num_joints, num_bodies = len(g1.JOINT_NAMES), len(g1.BODY_NAMES)

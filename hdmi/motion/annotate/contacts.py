@@ -52,7 +52,7 @@ def find_contacts(playback: Playback, config: ObjectConfig, criteria: ContactCri
 
     Contact is nearness of the surfaces, with hysteresis, that is no passing by; in a wider range while the object moves
     along. It counts where the object is moved, and for a while around that: hands that rest on an object that nobody
-    moves do not interact with it.
+    moves do not interact with it. An object that is fixed in the world cannot be moved: there all contact counts.
 
     Raises:
         MotionError: for an effector without a collision shape.
@@ -78,7 +78,8 @@ def label_contacts(
     relative = np.linalg.norm(derivative(local, fps), axis=-1)  # [T, E]
     turning = np.einsum("tij,tej->tei", derivative(link_mat, fps), local)
     speed = np.linalg.norm(derivative(link_pos, fps)[:, None] + turning, axis=-1)
-    columns = [_label(gap[:, i], speed[:, i], relative[:, i], fps, criteria) for i in range(gap.shape[1])]
+    fixed = playback.scene.object_free_dof is None and playback.scene.object_hinge_dof is None
+    columns = [_label(gap[:, i], speed[:, i], relative[:, i], fixed, fps, criteria) for i in range(gap.shape[1])]
     return np.stack(columns, axis=1), speed
 
 
@@ -148,7 +149,7 @@ def _shape_points(playback: Playback, body: str) -> tuple[np.ndarray, np.ndarray
 
 
 def _label(
-    gap: np.ndarray, speed: np.ndarray, relative: np.ndarray, fps: float, criteria: ContactCriteria
+    gap: np.ndarray, speed: np.ndarray, relative: np.ndarray, fixed: bool, fps: float, criteria: ContactCriteria
 ) -> np.ndarray:
     """Contact of one effector. [T] each -> bool [T]"""
     moving = speed > criteria.moving
@@ -160,7 +161,9 @@ def _label(
     out = np.zeros_like(label)
     for first, last in intervals(label):
         moved = first + np.flatnonzero(moving[first : last + 1])
-        if last - first >= pause and moved.size:
+        if last - first >= pause and fixed:
+            out[first : last + 1] = True
+        elif last - first >= pause and moved.size:
             out[max(first, moved[0] - lead) : min(last, moved[-1] + lead) + 1] = True
     return out
 

@@ -372,7 +372,7 @@ def _motion(
 def _report(plan: Plan, result: ik.IkResult, motion: Motion, load: Load, paths: _Paths, time: np.ndarray) -> Authored:
     rows = {f"{side} hand": HANDS[side] for side in SIDES} | {f"{side} foot": FEET[side] for side in SIDES}
     misses = {name: float(np.nanmax(result.residuals[row])) for name, row in rows.items()}
-    misses["com"] = float(np.nanmax(result.residuals["com"]))
+    misses["centre of mass"] = float(np.nanmax(result.residuals["com"]))
     for name, row in rows.items():
         allowed = MAX_MISS[name.split()[1]]
         if misses[name] > allowed:

@@ -33,6 +33,7 @@ HEEL = (-0.05, 0.0, -0.03)
 SOLE_HEIGHT = -g1.FOOT_POINTS[0][2] + g1.FOOT_POINT_RADIUS  # of the ankle's origin above the ground, m
 _PALM_SHARE = 0.054  # from wrist to palm in shares of the height: half a hand (Winter, figure 4.1)
 _ANKLE_SHARE = 0.039  # of the ankle above the sole (Winter, figure 4.1)
+_POINTED = 0.3  # sine of the angle between foot and shank from which on the foot is in line with it
 _EXTENSION = 0.985  # of a leg's length, at most: a straight knee is singular
 _REQUIRED = ("pelvis", *(f"{side}_{part}" for side in SIDES for part in ROBOT_JOINTS))
 
@@ -172,21 +173,22 @@ def _unit(name: str, vectors: np.ndarray) -> np.ndarray:
 def _foot_angles(pos: dict[str, np.ndarray], side: str, pelvis: Rotation) -> tuple[np.ndarray, np.ndarray]:
     """Pitch relative to the foot at rest on the ground, and yaw; without a foot joint flat, along the pelvis.
 
-    A foot on the tips of its toes points nowhere, or backwards: there the pelvis tells its heading, and its pitch can
-    exceed a right angle.
+    The axis about which the foot turns against the shank tells its heading: its toes do not when it is steep, and
+    point backwards where somebody kneels on their tips. So its pitch can exceed a right angle.
     """
-    forward = pelvis.as_matrix()[:, :2, 0]
-    forward = forward / np.maximum(np.linalg.norm(forward, axis=-1, keepdims=True), 1e-6)
-    if f"{side}_foot" not in pos:
-        return np.zeros(len(forward)), np.unwrap(np.arctan2(forward[:, 1], forward[:, 0]))
-    toes = pos[f"{side}_foot"] - pos[f"{side}_ankle"]
-    toes = toes / np.maximum(np.linalg.norm(toes, axis=-1, keepdims=True), 1e-6)
-    level = np.clip((np.linalg.norm(toes[:, :2], axis=-1) - 0.35) / 0.35, 0.0, 1.0)[:, None]
-    forward = forward + level**2 * (3 - 2 * level) * (toes[:, :2] - forward)
-    forward = forward / np.maximum(np.linalg.norm(forward, axis=-1, keepdims=True), 1e-6)
-    pitch = np.arctan2(-toes[:, 2], (toes[:, :2] * forward).sum(-1))
+    left = pelvis.as_matrix()[:, :, 1]
+    bends = f"{side}_foot" in pos
+    if bends:
+        toes = _direction(pos, f"{side}_ankle", f"{side}_foot")
+        axis = np.cross(_direction(pos, f"{side}_ankle", f"{side}_knee"), toes)
+        # a foot in line with its shank has none
+        left = axis + np.maximum(_POINTED - np.linalg.norm(axis, axis=-1, keepdims=True), 0.0) * left
+    yaw = np.unwrap(np.arctan2(-left[:, 0], left[:, 1]))
+    if not bends:
+        return np.zeros(len(yaw)), yaw
+    pitch = np.unwrap(np.arctan2(-toes[:, 2], toes[:, 0] * np.cos(yaw) + toes[:, 1] * np.sin(yaw)))
     low = pos[f"{side}_ankle"][:, 2] <= np.percentile(pos[f"{side}_ankle"][:, 2], 30)
-    return pitch - np.median(pitch[low]), np.unwrap(np.arctan2(forward[:, 1], forward[:, 0]))
+    return pitch - np.median(pitch[low]), yaw
 
 
 @dataclass(frozen=True)
@@ -251,16 +253,16 @@ def keypoints(body: Body, scaling: Scaling, ankles: dict[str, np.ndarray], fps: 
     knees, elbows, palms = {}, {}, {}
     for side, mirror in zip(SIDES, ([1, 1, 1], [1, -1, 1]), strict=True):
         hip = pelvis + body.pelvis.apply(robot.hip * mirror)
-        knees[side] = hip + robot.thigh * _direction(body, side, "hip", "knee")
+        knees[side] = hip + robot.thigh * _direction(body.pos, f"{side}_hip", f"{side}_knee")
         shoulder = torso + body.torso.apply(robot.shoulder * mirror)
-        elbows[side] = shoulder + robot.upper_arm * _direction(body, side, "shoulder", "elbow")
-        wrist = elbows[side] + robot.forearm * _direction(body, side, "elbow", "wrist")
+        elbows[side] = shoulder + robot.upper_arm * _direction(body.pos, f"{side}_shoulder", f"{side}_elbow")
+        wrist = elbows[side] + robot.forearm * _direction(body.pos, f"{side}_elbow", f"{side}_wrist")
         palms[side] = wrist + robot.hand * body.hands[side].as_matrix()[:, :, 0]
     return Keypoints(pelvis, knees, elbows, palms)
 
 
-def _direction(body: Body, side: str, start: str, end: str) -> np.ndarray:
-    bone = body.pos[f"{side}_{end}"] - body.pos[f"{side}_{start}"]
+def _direction(pos: dict[str, np.ndarray], start: str, end: str) -> np.ndarray:
+    bone = pos[end] - pos[start]
     return bone / np.maximum(np.linalg.norm(bone, axis=-1, keepdims=True), 1e-6)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -44,19 +45,56 @@ def obstacles(config: ObjectConfig, trajectory: ObjectTrajectory) -> list[Obstac
     ]
 
 
-def scale_object(trajectory: ObjectTrajectory, scale: float, config: ObjectConfig | None) -> ObjectTrajectory:
+def scale_object(
+    trajectory: ObjectTrajectory, scale: float, config: ObjectConfig | None, anchor: np.ndarray | None = None
+) -> ObjectTrajectory:
     """The object in the scaled scene: its orientation and size stay, its place and its height above ground scale.
 
     Heights are those of its lowest point, so that what stands on the ground still does; without geometry, those above
     the lowest of the trajectory. What is fixed in the world keeps its height.
+
+    Args:
+        anchor: the point of the object whose place is scaled, in its frame, m; its origin if absent. [3]
     """
     pos = trajectory.pos.astype(float)
+    lever = np.zeros_like(pos)
+    if anchor is not None:
+        lever = Rotation.from_quat(trajectory.quat.astype(float), scalar_first=True).apply(anchor)
     if config is None:
         above = pos[:, 2] - pos[:, 2].min()
     else:
         above = np.zeros(len(pos)) if config.fixed_base else np.maximum(lowest_point(config, trajectory), 0.0)
-    scaled = np.column_stack([scale * pos[:, :2], pos[:, 2] + (scale - 1) * above])
+    scaled = np.column_stack([pos[:, :2] + (scale - 1) * (pos + lever)[:, :2], pos[:, 2] + (scale - 1) * above])
     return ObjectTrajectory(trajectory.name, scaled.astype(np.float32), trajectory.quat, trajectory.joint_pos)
+
+
+def handled_point(palms: Sequence[np.ndarray], config: ObjectConfig, trajectory: ObjectTrajectory) -> np.ndarray:
+    """Where hands are on the object while they are nearest to it, in its frame, m; its origin if none comes near. [3]
+
+    In a scaled scene an object of true size has to grow away from those who handle it, wherever its origin is.
+
+    Args:
+        palms: in the person's scene, m. [T, 3] each
+    """
+    poses = object_poses(config, trajectory)
+    pos, base = poses[config.name]
+    gaps, points = [], []  # of each hand, [T] and [T, 3]
+    for palm in palms:
+        distances, nearest = [], []
+        for name, surface in object_surfaces(config).items():
+            link_pos, rotation = poses[name]
+            local = rotation.inv().apply(palm - link_pos)
+            distances.append(surface.distance(local))
+            nearest.append(base.inv().apply(link_pos + rotation.apply(surface.nearest(local)) - pos))
+        closest, frames = np.argmin(distances, axis=0), np.arange(len(palm))
+        gaps.append(np.min(distances, axis=0))
+        points.append(np.array(nearest)[closest, frames])
+    nearest_ever = np.min(gaps)
+    if nearest_ever > _FAR:
+        return np.zeros(3)
+    # of each hand that comes about as near
+    near = [gap <= nearest_ever + _NEAR for gap in gaps]
+    return np.mean([np.median(p[n], axis=0) for p, n in zip(points, near, strict=True) if n.any()], axis=0)
 
 
 def lowest_point(config: ObjectConfig, trajectory: ObjectTrajectory) -> np.ndarray:

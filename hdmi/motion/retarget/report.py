@@ -19,6 +19,7 @@ class RetargetReport:
     name: str
     frames: int
     fps: float
+    height: float  # of the person, as taken, m
     scale: float  # of the scene
     milliseconds: float  # per frame, of processor time for inverse kinematics
     iterations: float  # per frame
@@ -40,26 +41,30 @@ class RetargetReport:
 
     def table(self) -> RenderableType:
         """For people."""
-        bodies = Table(title=f"{self.name}: {self.frames} frames at {self.fps:g} fps, scene scaled by {self.scale:.3f}")
+        title = (
+            f"{self.name}: {self.frames} frames at {self.fps:g} fps, person of {self.height:.2f} m, "
+            f"scene scaled by {self.scale:.3f}"
+        )
+        bodies = Table()
         for column, justify in (("target", "left"), ("mean", "right"), ("p99", "right"), ("max", "right")):
             bodies.add_column(column, justify=justify)  # type: ignore[arg-type]
         for name, figures in self.residuals.items():
             factor, unit = (180 / np.pi, "deg") if name.endswith("orientation") else (100.0, "cm")
             bodies.add_row(name, *(f"{factor * figures[key]:.2f} {unit}" for key in ("mean", "p99", "max")))
-        rest = Table(title="motion", show_header=False)
+        rest = Table(show_header=False)
         rest.add_column()
         rest.add_column()
         rest.add_row("inverse kinematics", f"{self.milliseconds:.1f} ms and {self.iterations:.1f} programs per frame")
         rest.add_row("solver failures", _frames(self.solver_failures))
-        rest.add_row("unsettled", _frames(self.unsettled))
-        rest.add_row("stance", ", ".join(f"{side} {count} frames" for side, count in self.stance_frames.items()))
+        rest.add_row("not settled", _frames(self.unsettled))
+        rest.add_row("feet stand", ", ".join(f"{side} {count} frames" for side, count in self.stance_frames.items()))
         if self.slide is not None:
             rest.add_row("slide of standing feet", _statistics(self.slide, 100, "cm/s"))
         for name, figures in self.penetration.items():
             rest.add_row(f"penetration: {name}", _statistics(figures, 100, "cm"))
         rest.add_row("fastest joint", f"{100 * self.joint_speed:.0f} % of its limit")
         rest.add_row("joint jerk", f"{self.jerk:.0f} rad/s^3 rms")
-        return Group(bodies, rest)
+        return Group(title, bodies, rest)
 
     def save(self, path: str | Path) -> Path:
         """Writes the report as json."""

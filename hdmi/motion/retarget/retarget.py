@@ -36,7 +36,7 @@ from hdmi.motion.retarget.body import (
     read_body,
 )
 from hdmi.motion.retarget.feet import FootPaths, find_stances, foot_paths, slide
-from hdmi.motion.retarget.interaction import obstacles, on_object, scale_object
+from hdmi.motion.retarget.interaction import handled_point, obstacles, on_object, scale_object
 from hdmi.motion.retarget.report import RetargetReport, statistics
 
 # Weights per m and per rad. What touches the world counts most, then hands, pelvis and trunk; knees and elbows
@@ -101,7 +101,10 @@ def retarget(
     feet = foot_paths(body, stances, scaling, options.fps)
     points = keypoints(body, scaling, feet.pos, options.fps)
     source = None if human.object is None else _smooth_object(human.object, options)
-    scaled = None if source is None else scale_object(source, scaling.scale, object)
+    anchor = None
+    if object is not None and source is not None:
+        anchor = handled_point([body.pos[f"{side}_palm"] for side in SIDES], object, source)
+    scaled = None if source is None else scale_object(source, scaling.scale, object, anchor)
     solid: list[ik.Obstacle] = []
     palms = {side: (points.palms[side], np.zeros(human.num_frames)) for side in SIDES}
     if object is not None and source is not None and scaled is not None:
@@ -123,7 +126,7 @@ def retarget(
     )
     seconds = time.process_time() - started
     motion = _motion(human, object, scaled, effectors, result)
-    return motion, _report(motion, result, feet, scaling.scale, seconds)
+    return motion, _report(motion, result, feet, human.height, scaling.scale, seconds)
 
 
 def _smooth_object(thing: ObjectTrajectory, options: RetargetOptions) -> ObjectTrajectory:
@@ -206,7 +209,9 @@ def _contact(human: HumanMotion, effectors: Sequence[Effector]) -> np.ndarray | 
     return np.stack(columns, axis=1)
 
 
-def _report(motion: Motion, result: ik.IkResult, feet: FootPaths, scale: float, seconds: float) -> RetargetReport:
+def _report(
+    motion: Motion, result: ik.IkResult, feet: FootPaths, height: float, scale: float, seconds: float
+) -> RetargetReport:
     robot = len(g1.BODY_NAMES)
     speeds = slide(
         feet, motion.body_pos_w[:, :robot].astype(float), motion.body_quat_w[:, :robot].astype(float), motion.fps
@@ -218,6 +223,7 @@ def _report(motion: Motion, result: ik.IkResult, feet: FootPaths, scale: float, 
         name=motion.name,
         frames=motion.num_frames,
         fps=motion.fps,
+        height=height,
         scale=scale,
         milliseconds=1000 * seconds / motion.num_frames,
         iterations=float(result.iterations.mean()),

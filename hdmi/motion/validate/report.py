@@ -64,7 +64,7 @@ class Finding:
         text = f"{self.check} {self.value:.3g} {self.unit}, {bound}"
         if self.faults:
             worst = max(self.faults, key=lambda fault: fault.value)
-            text += f": {worst.part}, {_frames(self.faults)}"
+            text += f": {worst.part}, frames {_frames(self.faults)}"
         return text
 
 
