@@ -32,6 +32,8 @@ class Options:
 
 def report_on(path: Path, task: str | None) -> Report:
     """Validates the motion in a folder in the scene of a task."""
+    if not path.is_dir():
+        raise MotionError(f"{path}: no such folder; a motion is a folder with motion.npz and meta.json")
     name = path.resolve().name
     if task is None:
         task = name if (CONF / "task" / f"{name}.yaml").is_file() else "none"

@@ -49,6 +49,18 @@ def from_qpos(root_pos: np.ndarray, root_quat: np.ndarray, joint_pos: np.ndarray
     return motion_from_poses("made", FPS, g1.BODY_NAMES, g1.JOINT_NAMES, pos, quat, joint_pos)
 
 
+def with_box(motion: Motion, box_pos: np.ndarray) -> Motion:
+    """The motion beside an upright box with a path of its own. [T, 3]"""
+    extra = {
+        "body_pos_w": box_pos,
+        "body_quat_w": np.tile([1.0, 0.0, 0.0, 0.0], (T, 1)),
+        "body_lin_vel_w": derivative(box_pos, FPS),
+        "body_ang_vel_w": 0 * box_pos,
+    }
+    arrays = {key: np.concatenate([getattr(motion, key), value[:, None]], axis=1) for key, value in extra.items()}
+    return replace(motion, body_names=(*motion.body_names, "box"), **arrays)
+
+
 def within(first: int, last: int, value: float) -> np.ndarray:
     """`value` in a span of frames, else zero. [T]"""
     out = np.zeros(T)
@@ -211,6 +223,10 @@ class TestRobot:
         assert finding.verdict == "usable"
         assert finding.value == pytest.approx(expected, abs=0.02)
         assert spans(finding) == [(0, T - 1)]
+        # it is where the force acts, however large that is
+        bob = 0.009 * (1 - np.cos(2 * np.pi * 1.5 * np.arange(T) / FPS))
+        bobbing = from_qpos(root_pos + bob[:, None] * [0, 0, 1], root_quat, joint_pos)
+        assert validate_motion(bobbing)["centre_of_pressure"].value == pytest.approx(finding.value, rel=0.05)
 
 
 class TestObject:
@@ -225,24 +241,20 @@ class TestObject:
         standing = moved()
         box_pos = np.tile([1.0, 0.0, 0.1], (T, 1))
         box_pos[20:40, 0] = 0.2  # shins are at 0.0 to 0.1
-        motion = replace(
-            standing,
-            body_names=(*g1.BODY_NAMES, "box"),
-            **{
-                key: np.concatenate([getattr(standing, key), extra[:, None]], axis=1)
-                for key, extra in (
-                    ("body_pos_w", box_pos),
-                    ("body_quat_w", standing.body_quat_w[:, PELVIS]),
-                    ("body_lin_vel_w", 0 * box_pos),
-                    ("body_ang_vel_w", 0 * box_pos),
-                )
-            },
-        )
+        motion = with_box(standing, box_pos)
         report = validate_motion(motion, object=ObjectConfig("box", [{"box": (0.15, 0.3, 0.1)}]))
         assert report["object_penetration"].verdict != "good"
         assert spans(report["object_penetration"]) == [(20, 39)]
         assert "shin" in report["object_penetration"].faults[0].part
         assert spans(report["acceleration"]) == [(19, 20), (39, 40)]  # of the box
+
+    def test_box_that_glides_by_itself(self):
+        path = np.column_stack([1.0 + 0.3 * np.arange(T) / FPS, np.zeros(T), np.full(T, 0.1)])
+        box = ObjectConfig("box", [{"box": (0.15, 0.3, 0.1)}], friction=0.5)
+        finding = validate_motion(with_box(moved(), path), object=box)["object_force"]
+        assert finding.value == pytest.approx(0.45, abs=0.05)  # friction, mostly
+        still = np.repeat(path[:1], T, axis=0)
+        assert validate_motion(with_box(moved(), still), object=box)["object_force"].value < 0.01
 
     def test_label_before_the_hands_arrive(self, lift_box):
         motion, scene = lift_box
@@ -334,6 +346,9 @@ class TestJudge:
         values = np.array([[0.0, 1.2], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [1.7, 0.0], [1.5, 1.6]])
         finding = judge("check", Series(values, ["knee", "toe"]), self.LIMIT)
         assert finding.reason() == "check 1.7 m, above 1: knee, frames 0, 4-5"
+        assert (
+            judge("check", Series(values[:4], ["knee", "toe"]), self.LIMIT).reason().endswith("above 1: toe, frame 0")
+        )
         worse = judge("check", Series(2 * values, ["knee", "toe"]), self.LIMIT)
         assert worse.reason() == "check 3.4 m, above 2: knee, frames 0, 4-5"
 
@@ -373,10 +388,12 @@ class TestScript:
         assert report["verdict"] == "bad"
         assert "meta.json" in report["reasons"][0]
 
-    @pytest.mark.parametrize("arguments", [[], ["a", "b"], ["a", "tusk=none"], ["a", "task=nothing"]])
+    @pytest.mark.parametrize("arguments", [[], ["a", "b"], ["nowhere"], ["a", "tusk=none"], ["a", "task=nothing"]])
     def test_wrong_arguments(self, script, arguments, capsys):
         assert script.main(arguments) == 2
-        assert capsys.readouterr().err
+        said = capsys.readouterr()
+        assert len(said.err.splitlines()) == 1
+        assert not said.out
 
     def test_public_motions(self, script, public_motions):
         imperfect = script.report_on(public_motions / "move_suitcase", None)

@@ -94,7 +94,10 @@ def retarget(
     options = options or RetargetOptions()
     human = human.resample(options.fps)
     if object is not None and human.object is None:
-        raise MotionError(f"motion {human.name!r}: has no object poses, so {object.name!r} cannot be placed")
+        raise MotionError(
+            f"motion {human.name!r}: has no object poses, so {object.name!r} cannot be placed; retarget it without the "
+            "object, and give its poses as keyframes to annotation"
+        )
     body = read_body(human, options.cutoff)
     stances = find_stances(body, options.fps)
     scaling = find_scaling(human, body, stances.flat, options.scale)

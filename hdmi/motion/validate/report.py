@@ -64,7 +64,8 @@ class Finding:
         text = f"{self.check} {self.value:.3g} {self.unit}, {bound}"
         if self.faults:
             worst = max(self.faults, key=lambda fault: fault.value)
-            text += f": {worst.part}, frames {_frames(self.faults)}"
+            alone = len(self.faults) == 1 and worst.first == worst.last
+            text += f": {worst.part}, {'frame' if alone else 'frames'} {_frames(self.faults)}"
         return text
 
 
@@ -113,10 +114,8 @@ class Report:
     def table(self) -> Table:
         """All checks: value, bounds, verdict, the part and the frames at fault."""
         style = _STYLE[self.verdict]
-        table = Table(
-            title=f"{self.motion}: {self.num_frames} frames at {self.fps:g} Hz: [{style}]{self.verdict}[/{style}]",
-            title_justify="left",
-        )
+        length = f"{self.num_frames} frames at {self.fps:g} Hz: " if self.num_frames else ""
+        table = Table(title=f"{self.motion}: {length}[{style}]{self.verdict}[/{style}]", title_justify="left")
         for column in ("check", "value", "good", "bad", "unit", "verdict", "worst", "frames at fault"):
             table.add_column(column, justify="right" if column in ("value", "good", "bad") else "left")
         for finding in self.findings:
