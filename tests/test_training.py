@@ -26,6 +26,7 @@ TINY = [
     "num_envs=4", "algo.frames_per_env=8", "algo.minibatches=2", "algo.epochs=2", "total_frames=128",
     "algo.actor_hidden=[32]", "algo.critic_hidden=[32]", "algo.bf16=false", "checkpoint_interval=2",
     "logger=csv", "video=false", "num_threads=1", "eval_envs=2",
+    "algo.final_kl=0.015",  # as at the beginning: budgets are extended below, and the fall depends on the budget
 ]  # fmt: skip
 
 
@@ -62,6 +63,14 @@ class TestRun:
             not torch.equal(a, b) for a, b in zip(trainer.actor.parameters(), fresh.actor.parameters(), strict=True)
         ]
         assert all(moved)
+
+    def test_divergence_is_to_fall_linearly(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        trainer = Trainer(config("algo.desired_kl=0.016", "algo.final_kl=0.004", "algo.epochs=1"), tmp_path)
+        wanted: list[float] = []
+        monkeypatch.setattr(trainer.schedule, "step", lambda kl: wanted.append(trainer.schedule.target_kl))
+        trainer.run()
+        # two minibatches in each of four iterations
+        assert wanted[::2] == wanted[1::2] == pytest.approx([0.016, 0.013, 0.010, 0.007])
 
     def test_policy_loads_and_repeats(self, trained: tuple[Trainer, Path]) -> None:
         trainer, folder = trained

@@ -40,7 +40,8 @@ class Trainer:
 
     Each iteration collects `frames_per_env` steps of `num_envs` environments, estimates advantages by GAE
     (bootstrapping through truncations), makes `epochs` passes of minibatch updates, and then updates the observation
-    moments for the next collection. The actor's learning rate follows the policy's KL divergence.
+    moments for the next collection. The actor's learning rate follows the policy's KL divergence, which is to fall
+    from `desired_kl` to `final_kl` over `total_frames`, so that the policy settles.
 
     Args:
         cfg: the whole config.
@@ -114,6 +115,8 @@ class Trainer:
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """One PPO update on a batch [N, T]; returns losses and statistics."""
         algo = self.cfg.algo
+        progress = min(self.frames / self.cfg.total_frames, 1.0)
+        self.schedule.target_kl = algo.desired_kl + (algo.final_kl - algo.desired_kl) * progress
         with torch.no_grad():
             self.gae(batch)
         data = batch.select(*_LEARNER_KEYS).reshape(-1)
