@@ -111,12 +111,13 @@ class SceneryConfig:
     """A static body: never tracked, placed at the reference's pose of that name or at `pos`, `quat`.
 
     Args:
-        friction: sliding friction. MuJoCo takes the larger one of a pair, so 0 leaves it to what touches the body.
+        friction: sliding friction. MuJoCo takes the larger one of a pair, so the least there is
+            leaves it to what touches the body.
     """
 
     name: str
     geoms: Sequence[Any] = field(default_factory=tuple)
-    friction: float = 0.0
+    friction: float = mujoco.mjMINMU
     pos: Sequence[float] | None = None
     quat: Sequence[float] = _IDENTITY
     rgba: Sequence[float] = (0.55, 0.58, 0.62, 1.0)

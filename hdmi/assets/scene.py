@@ -206,10 +206,10 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
         pos=[1.5, -2.0, 5.0], dir=[-0.25, 0.35, -0.9], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         diffuse=[0.6, 0.6, 0.6], castshadow=True,
     )  # fmt: skip
-    # MuJoCo takes the larger sliding friction of a pair: with none of its own, the floor leaves it to what stands on it
+    # MuJoCo takes the larger sliding friction of a pair: the floor, with the least there is, leaves it to the other
     spec.worldbody.add_geom(
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.5], material="checker",
-        contype=WORLD_BIT, conaffinity=ROBOT_BIT | WORLD_BIT, condim=3, friction=[0.0, 0.005, 0.0001],
+        contype=WORLD_BIT, conaffinity=ROBOT_BIT | WORLD_BIT, condim=3, friction=[mujoco.mjMINMU, 0.005, 0.0001],
     )  # fmt: skip
 
 

@@ -49,9 +49,9 @@ def _card(state: dict, result: EvalResult, folder: Path, seed: int) -> str:
     lines = [
         f"# {state['task']}",
         "",
-        f"A policy after {state['frames']:,} frames, {state['elapsed'] / 60:.0f} minutes of collection and learning on "
-        f"{config['num_threads']} thread{'s' if config['num_threads'] > 1 else ''} of {_processor()} "
-        f"({os.cpu_count()} processors), seed {config['seed']}.",
+        f"A policy after {state['frames']:,} frames, {state['elapsed'] / 60:.0f} minutes of collection and learning, "
+        f"with {config['num_envs']} environments and {config['num_threads'] or 'all'} threads on {os.cpu_count()} "
+        f"processors ({_processor()}), seed {config['seed']}.",
         "",
         "```",
         command,

@@ -169,7 +169,7 @@ class CenterOfMassRandomization(ModelRandomization):
 class FrictionRandomization(ModelRandomization):
     """Draws one sliding friction for all geoms of the named bodies.
 
-    MuJoCo uses the larger friction of two geoms in contact; floor and scenery have none of their own.
+    MuJoCo uses the larger friction of two geoms in contact; floor and scenery have next to none of their own.
     """
 
     def __init__(
