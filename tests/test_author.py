@@ -60,7 +60,9 @@ class TestErrors:
             ({"duration": float("nan")}, ["duration", "number"]),
             ({"dance": []}, ["unknown 'dance'", "duration, phases"]),
             ({"hands": {"left": [{"at": 1, "pos": [0, 0]}]}}, ["hands.left[0].pos", "3 numbers", "[0, 0]"]),
-            ({"hands": {"left": [{"at": 1, "contact": 1}]}}, ["hands.left[0].contact", "true or false"]),
+            ({"hands": {"left": [{"at": 1, "contact": 1}]}}, ["hands.left[0].contact", "true, false or here"]),
+            ({"hands": {"left": [{"at": 1, "frame": "object", "contact": "here"}]}}, ["left[0].contact", "`pos`"]),
+            ({"hands": {"left": [{"at": 1, "pos": [0, 0, 0], "contact": "here"}]}}, ["contact", "frame 'object'"]),
             ({"hands": {"both": [], "left": []}}, ["hands", "either 'both'"]),
             ({"hands": {"tail": []}}, ["hands", "unknown 'tail'", "left, right"]),
             ({"pelvis": [{"at": "jump", "height": 1}]}, ["pelvis[0].at", "no phase 'jump'"]),
@@ -148,6 +150,11 @@ class TestKeys:
         assert hands["left"][0].pos == (1, 2, 3)
         right = hands["right"][0]
         assert (right.pos, right.rpy, right.out, right.gap) == ((1, -2, 3), (-0.1, 0.2, -0.3), (0, -1, 0), 0.1)
+
+    def test_contact_here(self):
+        here = {"at": 0, "frame": "object", "pos": [1, 2, 3], "contact": "here"}
+        hand = plan(hands={"left": [here, {"at": 1}, {"at": 2, "contact": False}]}).hands["left"]
+        assert [(key.contact, key.here) for key in hand] == [(True, True), (True, True), (False, False)]
 
     def test_a_key_moves_with_its_frame(self):
         moving = PosePath(np.outer(times(), [1.0, 0, 0]), Rotation.from_euler("z", np.full((200, 1), np.pi / 2)))
@@ -296,6 +303,16 @@ class TestMotions:
             point = pos[:, b] + Rotation.from_quat(quat[:, b], scalar_first=True).apply(effector.point)
             expected = np.add(effector.target, inside)
             np.testing.assert_allclose(point - box, np.tile(expected, (len(box), 1)), atol=5e-3)
+
+    def test_contact_points_are_the_task_s_or_where_the_plan_says(self):
+        here = {"at": 0, "frame": "object", "pos": [0.02, 0.14, -0.02], "contact": "here"}
+        content = {"duration": 0.1, "corrections": 0, "object": {"path": [{"at": 0, "pos": [0.35, 0, 0.9]}]}}
+        made = author_motion(plan(**content, hands={"left": [here]}), BOX, (), FINGERTIPS).motion
+        np.testing.assert_allclose(made.contact_points, [[(0.02, 0.14, -0.02), FINGERTIPS[1].target]] * 5, atol=1e-6)
+        np.testing.assert_array_equal(made.object_contact, [[True, False]] * 5)
+        elsewhere = {**here, "at": 0.05, "pos": [0, 0.14, 0]}
+        with pytest.raises(PlanError, match="left_wrist_yaw_link: one contact point 'here', got"):
+            author_motion(plan(**content, hands={"left": [here, elsewhere]}), BOX, (), FINGERTIPS)
 
     def test_lift_box_is_what_its_plan_makes(self):
         made = author_motion(load_plan(find_plan("lift_box")), BOX, [STAND], FINGERTIPS).motion

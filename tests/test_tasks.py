@@ -24,7 +24,7 @@ from torchrl.envs.utils import check_env_specs
 from hdmi.assets import default_joint_pos, g1
 from hdmi.build import ConfigError, Task, make_env, make_task, make_transforms
 from hdmi.evaluation.agents import task_names
-from hdmi.evaluation.tasks import check_task, list_tasks, measure_contacts, picture_frame, render_reference
+from hdmi.evaluation.tasks import check_task, list_tasks, measure_contacts, picture_frame, render_reference, sources
 from hdmi.motion import Motion, forward_kinematics, save_motion
 
 ROOT = CONF.parent
@@ -95,6 +95,10 @@ def env_of(name: str, motions: Path, num_envs: int = 2, *overrides: str) -> Tran
 class TestConfigs:
     def test_the_papers_fourteen_are_there(self):
         assert set(TASKS) >= PAPER | {"walk", "lift_box"}
+
+    def test_each_has_a_reference_of_its_own(self):
+        missing = [name for name in TASKS if "shipped" not in sources(load_config(f"task={name}"))]
+        assert missing == ["topple_wood_board", "traverse_door"]
 
     @pytest.mark.parametrize("name", TASKS)
     def test_builds(self, name, motions):

@@ -15,10 +15,19 @@ from mocks import load_script
 from hdmi.assets import Effector, ObjectConfig, default_joint_pos, g1
 from hdmi.build import scene_parts
 from hdmi.evaluation.agents import task_config
-from hdmi.motion import Motion, find_motion, forward_kinematics, load_motion, robot_model, save_motion
+from hdmi.motion import (
+    Motion,
+    find_motion,
+    forward_kinematics,
+    load_motion,
+    make_playback,
+    robot_model,
+    save_motion,
+)
 from hdmi.motion.kinematics import derivative
 from hdmi.motion.motion import motion_from_poses
 from hdmi.motion.validate import LIMITS, Limit, Series, judge, validate_motion
+from hdmi.motion.validate.checks import ground_gap
 
 FPS, T = 50.0, 60
 PELVIS = g1.BODY_NAMES.index("pelvis")
@@ -238,10 +247,9 @@ class TestObject:
         assert all(finding.value is not None for finding in report.findings)
 
     def test_body_in_the_object(self):
-        standing = moved()
         box_pos = np.tile([1.0, 0.0, 0.1], (T, 1))
         box_pos[20:40, 0] = 0.2  # shins are at 0.0 to 0.1
-        motion = with_box(standing, box_pos)
+        motion = with_box(moved(), box_pos)
         report = validate_motion(motion, object=ObjectConfig("box", [{"box": (0.15, 0.3, 0.1)}]))
         assert report["object_penetration"].verdict != "good"
         assert spans(report["object_penetration"]) == [(20, 39)]
@@ -255,6 +263,16 @@ class TestObject:
         assert finding.value == pytest.approx(0.45, abs=0.05)  # friction, mostly
         still = np.repeat(path[:1], T, axis=0)
         assert validate_motion(with_box(moved(), still), object=box)["object_force"].value < 0.01
+
+    def test_feet_are_as_high_as_what_they_stand_on(self):
+        box_pos = np.tile([0.0, 0.0, 0.1], (T, 1))
+        box = ObjectConfig("box", [{"box": (0.3, 0.3, 0.1)}])
+        for lift, gap in ((0.2, 0.0), (0.23, 0.03)):
+            playback = make_playback(with_box(moved(z=lift), box_pos), object=box)
+            assert ground_gap(playback) == pytest.approx(gap, abs=1e-3)
+        # what is carried is no ground
+        playback = make_playback(with_box(moved(z=0.2), box_pos + np.array([0, 0, 0.05])), object=box)
+        assert ground_gap(playback) == pytest.approx(0.2, abs=1e-3)
 
     def test_label_before_the_hands_arrive(self, lift_box):
         motion, scene = lift_box

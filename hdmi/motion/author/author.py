@@ -17,7 +17,7 @@ from hdmi.motion.author.balance import Load, centre_of_pressure, pendulum_com
 from hdmi.motion.author.footsteps import centre_of_pressure as planned_pressure
 from hdmi.motion.author.footsteps import foot_path, footprints, plan_steps, root_path
 from hdmi.motion.author.paths import PosePath, about, pose_path, rotation, value_path
-from hdmi.motion.author.plan import SIDES, Plan, PlanError, PoseKey
+from hdmi.motion.author.plan import SIDES, Plan, PlanError, PoseKey, Step
 from hdmi.motion.kinematics import derivative, forward_kinematics, minimum_jerk
 from hdmi.motion.motion import Motion, motion_from_poses
 
@@ -330,15 +330,27 @@ def _com(paths: _Paths, load: Load, time: np.ndarray) -> np.ndarray:
 
 
 def _contact_points(plan: Plan, paths: _Paths, effectors: Sequence[Effector], hands: Sequence[ik.Target]) -> np.ndarray:
-    """The task's targets; on an object that rolls, where the hands touch it, which moves over it. [T, E, 3]"""
+    """The task's targets, or where keys say `contact: here`; on an object that rolls, where the hands touch it, which
+    moves over it. [T, E, 3]"""
     points = np.empty((len(paths.pressure), len(effectors), 3))
     for e, effector in enumerate(effectors):
-        points[:, e] = effector.target
+        here = list(dict.fromkeys(key.pos for key in _keys_of(plan, effector.body) if key.here))
+        if len(here) > 1:
+            raise PlanError(f"{plan.file}: {effector.body}: one contact point 'here', got {here}")
+        points[:, e] = here[0] if here else effector.target
         hand = next((h for h in hands if isinstance(h, ik.PointTarget) and h.body == effector.body), None)
         if plan.rolls is not None and paths.object is not None and hand is not None:
             inward = paths.object.rot.inv().apply(np.asarray(hand.pos) - paths.object.pos)
             points[:, e] = plan.rolls * inward / np.linalg.norm(inward, axis=1, keepdims=True)
     return points
+
+
+def _keys_of(plan: Plan, body: str) -> tuple[PoseKey, ...]:
+    """Of a hand, or of all steps of a foot."""
+    side = body.split("_")[0]
+    if body == FEET.get(side):
+        return tuple(key for step in plan.feet if isinstance(step, Step) and step.side == side for key in step.via)
+    return plan.hands.get(side, ())
 
 
 # -- the result -----------------------------------------------------------------------------------------------

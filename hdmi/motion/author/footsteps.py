@@ -228,7 +228,9 @@ def _rebalanced(plan: Plan, pressure: np.ndarray, time: np.ndarray) -> np.ndarra
     """Moves the centre of pressure to where `balance` keys want it."""
     out, before = pressure, None
     for key in plan.balance:
-        over = pressure if key.values["over"] == "feet" else np.array([*key.values["over"], 0.0])
+        over = pressure.copy()
+        if key.values["over"] != "feet":
+            over[:, :2] = key.values["over"]
         begin = key.time - SHIFT_TIME if before is None else before.time
         out = out + minimum_jerk((time - begin) / (key.time - begin))[:, None] * (over - out)
         before = key

@@ -27,8 +27,9 @@ A pose key: `{at, frame, pos, rpy, point, out, gap, contact, rest, attach}`. `po
 `root` (heading frame on the ground between the feet), `torso`, `object` (the link that contact points are fixed to),
 `object_position` (world axes at the object), or the name of a piece of scenery. For an end effector of the task, `pos`
 and `point` (on the body) default to its target and point; `gap` moves it along `out`, off the surface or, below zero,
-into it. `contact: true` labels the contact from there on until a key with `contact: false`. `rest: true` hangs a hand
-at its side; `attach: FRAME` leaves an object or hand where it is and lets it move with the frame from there on.
+into it. `contact: true` labels the contact from there on until a key with `contact: false`; with `contact: here` the
+contact point is the key's `pos` on the object instead of the task's target. `rest: true` hangs a hand at its side;
+`attach: FRAME` leaves an object or hand where it is and lets it move with the frame from there on.
 """
 
 from __future__ import annotations
@@ -67,6 +68,7 @@ class PoseKey:
     out: Vector = (0.0, 0.0, 0.0)
     gap: float = 0.0
     contact: bool = False
+    here: bool = False  # the contact point is `pos`, not the task's target
     attach: str | None = None
     where: str = field(default="", compare=False)  # file and key, for messages
 
@@ -345,9 +347,9 @@ def _pose_keys(nodes: Sequence[_Node]) -> tuple[PoseKey, ...]:
             if "frame" in node.value and node.get("frame") != before.frame:
                 # figures of another frame mean nothing in this one
                 before = replace(before, pos=None, out=(0.0, 0.0, 0.0), gap=0.0)
-            contact = node.get("contact", before.contact)
-            if not isinstance(contact, bool):
-                raise PlanError(f"{node.at('contact')}: expected true or false, got {contact!r}")
+            contact = node.get("contact", "here" if before.here else before.contact)
+            if not isinstance(contact, bool) and contact != "here":
+                raise PlanError(f"{node.at('contact')}: expected true, false or here, got {contact!r}")
             key = PoseKey(
                 time=0.0,
                 frame=str(node.get("frame", before.frame)),
@@ -356,9 +358,12 @@ def _pose_keys(nodes: Sequence[_Node]) -> tuple[PoseKey, ...]:
                 point=node.vector("point", 3, before.point),
                 out=node.vector("out", 3, before.out),
                 gap=node.number("gap", before.gap),
-                contact=contact,
+                contact=bool(contact),
+                here=contact == "here",
                 attach=node.get("attach", None),
             )
+            if key.here and (key.frame != "object" or key.pos is None):
+                raise PlanError(f"{node.at('contact')}: 'here' is a `pos` in the frame 'object'")
         keys.append(replace(key, time=node.time("at"), where=node.where))
         _after(keys, node)
     return tuple(keys)

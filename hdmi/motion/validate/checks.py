@@ -100,36 +100,42 @@ def _difference(values: np.ndarray, order: int) -> np.ndarray:
     return out
 
 
+def clearance(playback: Playback) -> np.ndarray:
+    """Distances of the robot's geoms from what it may stand on, m. [T, R]
+
+    That is the ground, and an object that stands itself; but not on its arms there: those hold it.
+    """
+    scene = playback.scene
+    if not scene.object_geoms.size:
+        return playback.ground_distance
+    names = [_geom_name(playback, g) for g in playback.robot_geoms]
+    on_arms = np.array([any(word in name for word in ("shoulder", "elbow", "wrist", "hand")) for name in names])
+    stands = (playback.object_clearance.min(axis=1) < TOUCH) | (scene.object_free_dof is None)
+    return np.minimum(playback.ground_distance, np.where(stands[:, None] & ~on_arms, playback.object_distance, np.inf))
+
+
 def ground_gap(playback: Playback) -> float:
-    """Height of the robot's lowest point over the ground in the median frame, m; 0 if it stands on or in it."""
-    return max(float(np.median(playback.ground_distance.min(axis=1))), 0.0)
+    """Height of the robot's lowest point over what it may stand on in the median frame, m; 0 if it is on or in it."""
+    return max(float(np.median(clearance(playback).min(axis=1))), 0.0)
 
 
 def ground(playback: Playback, dynamics: Dynamics, gap: float) -> dict[str, Series]:
-    """Standing: clearance, penetration, slide, and what inverse dynamics asks of the ground.
-
-    A robot may stand on an object, too, that stands itself, but not on its arms there: those hold it.
-    """
-    scene, names = playback.scene, [_geom_name(playback, g) for g in playback.robot_geoms]
-    to_ground = playback.ground_distance
-    on_arms = np.array([any(word in name for word in ("shoulder", "elbow", "wrist", "hand")) for name in names])
-    clearance = to_ground
-    if scene.object_geoms.size:
-        stands = (playback.object_clearance.min(axis=1) < TOUCH) | (scene.object_free_dof is None)
-        clearance = np.minimum(to_ground, np.where(stands[:, None] & ~on_arms, playback.object_distance, np.inf))
-    floating = clearance.min(axis=1, keepdims=True).clip(min=0)
+    """Standing: clearance, penetration, slide, and what inverse dynamics asks of the ground."""
+    names = [_geom_name(playback, g) for g in playback.robot_geoms]
+    to_ground, from_support = playback.ground_distance, clearance(playback)
+    floating = from_support.min(axis=1, keepdims=True).clip(min=0)
     floating[dynamics.in_flight] = np.nan
     return {
         "standing_height": Series(floating, ["robot"]),
         "floating": Series(floating, ["robot"]),
         "ground_penetration": Series((-to_ground).clip(min=0), names),
-        "foot_slide": Series(_slide(playback, clearance, gap), g1.FEET),
+        "foot_slide": Series(_slide(playback, from_support, gap), g1.FEET),
         "ground_force": Series(dynamics.missing_force[:, None], ["robot"]),
         "centre_of_pressure": Series(dynamics.cop_distance[:, None], ["robot"]),
     }
 
 
-def _slide(playback: Playback, clearance: np.ndarray, gap: float) -> np.ndarray:
+def _slide(playback: Playback, from_support: np.ndarray, gap: float) -> np.ndarray:
     """Horizontal speed of the slowest of a foot's points on the ground; NaN while it swings or has just landed. [T, 2]
 
     A foot close to the ground that is fast while the other one stands is taken to swing.
@@ -137,7 +143,7 @@ def _slide(playback: Playback, clearance: np.ndarray, gap: float) -> np.ndarray:
     of_foot = [playback.on_bodies([foot]) for foot in g1.FEET]
     pos = np.stack([data.geom_xpos[playback.robot_geoms] for data in playback.frames()])  # [T, R, 3]
     speed = np.linalg.norm(derivative(pos, playback.fps)[..., :2], axis=-1)
-    speed = np.where(clearance <= gap + _PLANTED, speed, np.inf)
+    speed = np.where(from_support <= gap + _PLANTED, speed, np.inf)
     slide = np.stack([speed[:, geoms].min(axis=1, initial=np.inf) for geoms in of_foot], axis=1)
     swings = (slide > _SWING) & (slide[:, ::-1] < _SWING)
     planted = np.isfinite(slide) & ~swings
