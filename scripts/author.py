@@ -40,7 +40,7 @@ def author(options: Options, console: Console) -> tuple[Authored, Path]:
         raise ConfigError("give task=NAME")
     parts = scene_parts(task_config(options.task))
     plan = load_plan(options.plan or find_plan(options.task))
-    with Progress(console=console, transient=True) as progress:
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         bar = progress.add_task(plan.name, total=None)
         authored = author_motion(
             plan,

@@ -79,7 +79,7 @@ def run(options: Options, console: Console) -> tuple[Path, RetargetReport]:
         ik=IkOptions(floor=0.0, smoothing=SMOOTHING, self_collision=0.005 if options.self_collision else None),
     )
     num_frames = human.resample(options.fps).num_frames
-    with Progress(console=console, transient=True) as progress:
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         bar = progress.add_task(human.name, total=num_frames)
         motion, report = retarget(
             human,

@@ -85,6 +85,7 @@ def test_joints_keep_to_their_ranges_and_speeds():
     assert (speed <= limit + 1e-4).all()
     assert (speed.max(axis=0) > 0.99 * limit).any()  # the hand would be faster if it could
     assert np.nanmax(result.residuals["right_wrist_yaw_link"]) > 1.0
+    assert np.nanmax(result.residuals["left_ankle_roll_link planted"]) < 5e-3  # however far the hand is pulled
     assert not len(result.failures)
 
 
@@ -123,6 +124,17 @@ def test_smoothing_takes_jerk_out_of_a_noisy_target():
     rough, smooth = (ik.solve(targets, 30, FPS, options=IkOptions(smoothing=s)).joint_pos for s in (0.0, 10.0))
     jerk = [np.sqrt((np.diff(joints, n=3, axis=0) ** 2).mean()) for joints in (rough, smooth)]
     assert jerk[1] < 0.5 * jerk[0]
+
+
+def test_joints_go_on_as_they_move_where_nothing_else_decides():
+    moving = np.tile(default_joint_pos(), (12, 1))
+    elbow = g1.JOINT_NAMES.index("left_elbow_joint")
+    moving[:, elbow] += 0.02 * np.arange(12)
+    weight = np.where(np.arange(12) < 6, 1000.0, 0.0)[:, None]
+    result = ik.solve([*feet(), PostureTarget(moving, weight)], 12, FPS, options=IkOptions(smoothing=10.0))
+    steps = np.diff(result.joint_pos[:, elbow])
+    np.testing.assert_allclose(steps[:5], 0.02, atol=1e-3)
+    np.testing.assert_allclose(steps[5:8], 0.02 * 0.8 ** np.arange(1, 4), atol=1e-3)
 
 
 def test_frames_without_weight_have_no_residual():

@@ -9,6 +9,7 @@ import torch
 
 from hdmi.assets import Effector, HingeConfig, ObjectConfig, SceneryConfig, g1
 from hdmi.motion import MotionError, find_motion, forward_kinematics, load_motion, make_reference, save_motion
+from hdmi.motion.kinematics import angular_velocity, derivative
 from hdmi.motion.reference import resample
 
 FPS, T = 50.0, 21  # of the synthetic motion in conftest.py
@@ -193,6 +194,14 @@ class TestErrors:
     def test_label_between_zero_and_one(self, write_motion, motion_arrays):
         broken = changed(motion_arrays["object_contact"], (12, 0), 0.5)
         self.refused(write_motion(object_contact=broken), "motion.npz", "object_contact", "0.5", "frame 12")
+
+
+@pytest.mark.parametrize("fps", [30.0, 120.0])
+def test_velocities_are_per_second(fps):
+    angle = 0.8 * np.arange(5) / fps
+    quat = np.stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)], axis=-1)
+    np.testing.assert_allclose(angular_velocity(quat, fps), [[0, 0, 0.8]] * 5, atol=1e-6)
+    np.testing.assert_allclose(derivative(angle, fps), 0.8, atol=1e-6)
 
 
 class TestResample:

@@ -11,12 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig
 from hdmi.motion.annotate.contacts import ContactCriteria, contact_points, find_contacts
-from hdmi.motion.annotate.overrides import Overrides
+from hdmi.motion.annotate.overrides import FILE, Overrides
 from hdmi.motion.annotate.trajectory import complete_hinge, complete_trajectory
 from hdmi.motion.check import MotionError
 from hdmi.motion.kinematics import angular_velocity, derivative
 from hdmi.motion.motion import Motion
 from hdmi.motion.playback import make_playback
+
+_GIVE_POSE = f"give its pose in at least one frame, under `object` in {FILE}"
 
 
 def annotate_motion(
@@ -43,6 +45,8 @@ def annotate_motion(
         raise MotionError(f"annotation: {sorted(unknown)} are no effectors of the task; those are {names}")
     if overrides.object or overrides.hinge:
         motion = complete_object(motion, object=object, effectors=effectors, overrides=overrides)
+    if object.name not in motion.body_names:
+        raise MotionError(f"motion {motion.name!r}: lacks the task's object {object.name!r}: {_GIVE_POSE}")
     playback = make_playback(
         replace(motion, object_contact=None, contact_points=None),
         robot=robot,
@@ -88,7 +92,7 @@ def complete_object(
         pos, quat = complete_trajectory(overrides.object, hand_pos, hand_quat, carried)
         motion = _with_body(motion, object.name, pos, quat)
     elif object.name not in motion.body_names:
-        raise MotionError(f"annotation: the motion has no body {object.name!r}: give its pose in at least one frame")
+        raise MotionError(f"annotation: the motion has no body {object.name!r}: {_GIVE_POSE}")
     if object.hinge is None:
         if overrides.hinge:
             raise MotionError(f"annotation: hinge: the object {object.name!r} has none")
