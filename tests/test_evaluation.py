@@ -24,6 +24,8 @@ from hdmi.evaluation.protocol import FirstEpisodes, StartAtFrame, evaluation_con
 from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from hdmi.learning.policy import load_policy, make_networks
 
+ROOT = Path(__file__).parents[1]
+
 FIGURES = (
     "success_rate", "survival", "joint_error", "body_error", "root_pos_error", "root_ori_error", "object_pos_error",
     "object_ori_error", "contact_rate",
@@ -316,6 +318,20 @@ def test_an_exported_policy_acts_like_its_checkpoint(
     assert card == capsys.readouterr().out[:-1]
     assert "after 96 frames, 2 minutes" in card
     assert f"| survival | {100 * figures['survival']['mean']:.1f} % |" in card
+
+
+@pytest.mark.parametrize("folder", sorted((ROOT / "zoo").iterdir()), ids=lambda folder: folder.name)
+def test_the_zoo(folder: Path):
+    """Its policies are of this package's format, small, and successful by their own evaluation."""
+    actor, cfg, info = load_policy(folder)
+    assert cfg.task.name == folder.name
+    assert Path(info["file"]).stat().st_size < 2e6
+    env = make_env(evaluation_config(cfg), 2)
+    assert actor(env.reset())["action"].isfinite().all()
+    figures = EvalResult.load(folder / "eval.json")
+    assert figures["frames"] == info["frames"]
+    assert figures["success_rate"]["mean"] >= 0.9
+    assert f"{100 * figures['success_rate']['mean']:.1f} %" in (folder / "README.md").read_text()
 
 
 def test_export_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -24,7 +24,15 @@ from torchrl.envs.utils import check_env_specs
 from hdmi.assets import default_joint_pos, g1
 from hdmi.build import ConfigError, Task, make_env, make_task, make_transforms
 from hdmi.evaluation.agents import task_names
-from hdmi.evaluation.tasks import check_task, list_tasks, measure_contacts, picture_frame, render_reference, sources
+from hdmi.evaluation.tasks import (
+    TaskCheck,
+    check_task,
+    list_tasks,
+    measure_contacts,
+    picture_frame,
+    render_reference,
+    sources,
+)
 from hdmi.motion import Motion, forward_kinematics, save_motion
 
 ROOT = CONF.parent
@@ -263,6 +271,13 @@ class TestCheck:
         assert unlabelled == "right_wrist_yaw_link: the motion labels no contact"
         assert 0 < check.zero["survival"]["mean"] <= 1
 
+    def test_improvement_is_that_after_the_worlds_have_settled(self):
+        assert TaskCheck("walk", returns=[9.0, 9.0, 1.0, 2.0, 0.0, 0.0, 3.0, 4.0]).learned == (1.5, 3.5)
+
+    def test_a_training_is_long_enough_to_be_compared(self):
+        with pytest.raises(ConfigError, match="frames: expected 0 or at least 1024, four iterations of 16 worlds"):
+            check_task("lift_box", frames=1000, num_envs=16)
+
     def test_list_has_all_tasks(self, motions):
         table = list_tasks(str(motions))
         assert list(table.columns[0].cells) == TASKS
@@ -276,7 +291,7 @@ class TestCheck:
     COMMAND = (sys.executable, str(ROOT / "scripts" / "tasks.py"))
 
     def test_script(self):
-        options = ["check", "lift_box", "frames=256", "num_envs=16", "jobs=1"]
+        options = ["check", "lift_box", "frames=1024", "num_envs=16", "jobs=1"]
         result = subprocess.run([*self.COMMAND, *options], capture_output=True, text=True, timeout=300)
         # so short a training may or may not improve; everything else must pass
         assert result.returncode in (0, 1), result.stderr

@@ -50,8 +50,8 @@ def _card(state: dict, result: EvalResult, folder: Path, seed: int) -> str:
         f"# {state['task']}",
         "",
         f"A policy after {state['frames']:,} frames, {state['elapsed'] / 60:.0f} minutes of collection and learning, "
-        f"with {config['num_envs']} environments and {config['num_threads'] or 'all'} threads on {os.cpu_count()} "
-        f"processors ({_processor()}), seed {config['seed']}.",
+        f"with {config['num_envs']} environments on {config['num_threads'] or 'all'} of {os.cpu_count()} processors "
+        f"({_processor()}), seed {config['seed']}.",
         "",
         "```",
         command,
