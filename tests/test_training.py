@@ -19,6 +19,7 @@ from omegaconf import DictConfig
 from hdmi.cli import run_folder
 from hdmi.learning import CheckpointError, RunningNorm, Trainer, load_checkpoint, load_policy, save_checkpoint
 from hdmi.learning.checkpoint import checkpoints, claim
+from hdmi.learning.policy import export_policy
 from hdmi.learning.trainer import DivergenceError
 
 ROOT = Path(__file__).parents[1]
@@ -94,6 +95,11 @@ class TestResume:
             torch.testing.assert_close(a, b, rtol=0, atol=0)
         rows = list(csv.DictReader((tmp_path / "metrics.csv").open()))
         assert [int(row["iteration"]) for row in rows] == [1, 2, 3, 4]
+
+    def test_an_exported_policy_cannot_be_continued(self, trained: tuple[Trainer, Path], tmp_path: Path) -> None:
+        policy = export_policy(trained[1], tmp_path / "policy.pt")
+        with pytest.raises(CheckpointError, match="an exported policy, without critic"):
+            Trainer(config(f"resume={policy}"), tmp_path)
 
     def test_after_kill_9(self, tmp_path: Path) -> None:
         command = [
