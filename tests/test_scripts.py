@@ -49,6 +49,8 @@ def test_sweep_runs_as_jobs(tmp_path: Path) -> None:
         assert "success_rate" in json.loads((folder / "eval.json").read_text())
     starts = {name: OmegaConf.load(folder / "config.yaml").reset.state.start for name, folder in runs.items()}
     assert starts == {"full_seed3": "uniform", "no_rsi_seed3": "first"}
+    called = OmegaConf.load(runs["no_rsi_seed3"] / "config.yaml").overrides
+    assert {"+ablation=no_rsi", "seed=3", *TINY} <= set(called)
     assert len(list((tmp_path / "sweep" / ".submitit").glob("*/*_0_result.pkl"))) == 2
 
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from functools import cache
 from pathlib import Path
+from unittest.mock import patch
 
 import imageio.v2 as imageio
 import mujoco
@@ -23,14 +24,15 @@ from torchrl.envs.utils import check_env_specs
 
 from hdmi.assets import default_joint_pos, g1
 from hdmi.build import ConfigError, Task, make_env, make_task, make_transforms
-from hdmi.evaluation.agents import task_names
+from hdmi.evaluation.agents import BlindAgent, task_names
 from hdmi.evaluation.tasks import (
-    TaskCheck,
+    Training,
     check_task,
     list_tasks,
     measure_contacts,
     picture_frame,
     render_reference,
+    returns,
     sources,
 )
 from hdmi.motion import Motion, forward_kinematics, save_motion
@@ -271,12 +273,24 @@ class TestCheck:
         assert unlabelled == "right_wrist_yaw_link: the motion labels no contact"
         assert 0 < check.zero["survival"]["mean"] <= 1
 
-    def test_improvement_is_that_after_the_worlds_have_settled(self):
-        assert TaskCheck("walk", returns=[9.0, 9.0, 1.0, 2.0, 0.0, 0.0, 3.0, 4.0]).learned == (1.5, 3.5)
+    def test_gain_is_that_of_the_same_episodes(self):
+        gain, error = Training(before=np.array([1.0, 5.0, 9.0]), after=np.array([2.0, 7.0, 12.0])).gain
+        assert gain == pytest.approx(2.0)
+        assert error == pytest.approx(1 / 3**0.5)
 
-    def test_a_training_is_long_enough_to_be_compared(self):
-        with pytest.raises(ConfigError, match="frames: expected 0 or at least 1024, four iterations of 16 worlds"):
-            check_task("lift_box", frames=1000, num_envs=16)
+    def test_the_same_policy_earns_the_same(self):
+        # starts and randomization are drawn alike, so that only the policy makes a difference
+        cfg = load_config()
+        task, agent = make_task(cfg), BlindAgent("zero", cfg.action.history.size)
+        with patch.multiple("hdmi.evaluation.tasks", _RETURN_ENVS=8, _RETURN_STEPS=4):
+            first, second = returns(cfg, task, agent), returns(cfg, task, agent)
+        assert first.shape == (8,)
+        assert np.ptp(first) > 0
+        assert np.array_equal(first, second)
+
+    def test_a_negative_number_of_frames_is_refused(self):
+        with pytest.raises(ConfigError, match="frames: expected 0 or more, got -1"):
+            check_task("lift_box", frames=-1)
 
     def test_list_has_all_tasks(self, motions):
         table = list_tasks(str(motions))

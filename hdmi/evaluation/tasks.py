@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 import tempfile
@@ -14,9 +13,10 @@ from pathlib import Path
 
 import imageio.v2 as imageio
 import numpy as np
+import torch
 from omegaconf import DictConfig
 from rich.table import Table
-from torchrl.envs.utils import check_env_specs
+from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
 from hdmi.build import ConfigError, Task, make_env, make_task, scene_parts, set_threads
 from hdmi.envs.rendering import WorldRenderer
@@ -28,6 +28,7 @@ from hdmi.motion import MotionError, find_motion, load_motion, make_playback
 from hdmi.motion.annotate import intervals
 
 _SPEC_ENVS, _EPISODES = 2, 16
+_RETURN_ENVS, _RETURN_STEPS = 256, 64  # episodes before and after a training, and control steps of each
 _DISTANCE = 3.2  # of the camera, m
 
 
@@ -134,6 +135,24 @@ def measure_contacts(cfg: DictConfig) -> list[Contact]:
     return contacts
 
 
+@dataclass(frozen=True)
+class Training:
+    """What a short training changed: returns of the untrained and of the trained policy, in the same episodes.
+
+    Args:
+        before, after: sum of rewards over the first steps of each episode. [N]
+    """
+
+    before: np.ndarray
+    after: np.ndarray
+
+    @property
+    def gain(self) -> tuple[float, float]:
+        """Mean difference of the returns, and its standard error."""
+        difference = self.after - self.before
+        return float(difference.mean()), float(difference.std(ddof=1) / math.sqrt(len(difference)))
+
+
 @dataclass
 class TaskCheck:
     """What the smoke test of one task found; `problems` is empty if it passed."""
@@ -141,18 +160,9 @@ class TaskCheck:
     name: str
     contacts: list[Contact] = field(default_factory=list)
     zero: EvalResult | None = None  # servos that follow the reference
-    returns: list[float] = field(default_factory=list)  # mean reward of each training iteration
+    training: Training | None = None
     seconds: float = 0.0
     problems: list[str] = field(default_factory=list)
-
-    @property
-    def learned(self) -> tuple[float, float]:
-        """Mean reward of the second and of the last quarter of the training iterations.
-
-        In the first one all worlds have just been put onto the reference: rewards fall while their errors grow.
-        """
-        quarter = len(self.returns) // 4
-        return float(np.mean(self.returns[quarter : 2 * quarter])), float(np.mean(self.returns[-quarter:]))
 
 
 def check_task(
@@ -164,7 +174,9 @@ def check_task(
     2. The reference, replayed without physics, meets the object where its labels say: end effectors are on average as
        close to their contact points as the lost-contact termination asks for.
     3. Servos that follow the reference give finite survival and errors.
-    4. A training of `frames` control steps earns more reward in its last quarter than in its second; 0 skips it.
+    4. A training of `frames` control steps improves the return: both policies play the first steps of the same
+       episodes (start frames, perturbations and randomization drawn alike), and the mean difference is at least
+       twice its standard error. 0 skips it.
 
     Raises:
         ConfigError, MotionError: if the task or its motion does not exist or cannot be used.
@@ -172,8 +184,8 @@ def check_task(
     start = time.perf_counter()
     cfg = task_config(name, motion_root)
     cfg.num_envs, cfg.total_frames, cfg.num_threads, cfg.logger.wandb = num_envs, frames, num_threads, None
-    if 0 < frames < (least := 4 * num_envs * cfg.algo.frames_per_env):
-        raise ConfigError(f"frames: expected 0 or at least {least}, four iterations of {num_envs} worlds, got {frames}")
+    if frames < 0:
+        raise ConfigError(f"frames: expected 0 or more, got {frames}")
     set_threads(num_threads)
     task = make_task(cfg)
     check = TaskCheck(name)
@@ -197,20 +209,34 @@ def check_task(
     if bad or not check.zero.figures():
         check.problems.append(f"no policy: {bad or 'no figures'} not finite")
     if frames:
-        check.returns = _train(cfg)
-        first, last = check.learned
-        if not last > first:
-            check.problems.append(f"training: mean reward {first:.4f} in the second quarter, {last:.4f} in the last")
+        check.training = _train(cfg, task)
+        gain, deviation = check.training.gain
+        if not gain > 2 * deviation:
+            check.problems.append(f"training: the return changed by {gain:+.3f}, standard error {deviation:.3f}")
     check.seconds = time.perf_counter() - start
     return check
 
 
-def _train(cfg: DictConfig) -> list[float]:
-    """Mean reward of each iteration of a training that leaves nothing behind."""
+def _train(cfg: DictConfig, task: Task) -> Training:
+    """What a training changes; it leaves nothing behind."""
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()):
-        Trainer(cfg, Path(folder)).run()
-        with (Path(folder) / "metrics.csv").open(encoding="utf-8", newline="") as file:
-            return [float(row["reward"]) for row in csv.DictReader(file)]
+        trainer = Trainer(cfg, Path(folder))
+        before = returns(cfg, task, trainer.actor)
+        trainer.run()
+        return Training(before, returns(cfg, task, trainer.actor))
+
+
+def returns(cfg: DictConfig, task: Task, actor: torch.nn.Module) -> np.ndarray:
+    """Sum of rewards over the first steps of episodes that are the same in each call, acting without noise. [N]"""
+    with torch.random.fork_rng(), torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        torch.manual_seed(cfg.seed)
+        env = make_env(cfg, _RETURN_ENVS, task)
+        env.set_seed(cfg.seed)
+        steps = env.rollout(_RETURN_STEPS, actor, break_when_any_done=False)["next"]
+        env.close()
+    done = steps["done"].int()
+    first = done.cumsum(1) - done == 0  # up to the end of the first episode. [N, T, 1]
+    return (steps["reward"] * first).sum((1, 2)).numpy()
 
 
 def check_table(checks: Sequence[TaskCheck]) -> Table:
@@ -218,7 +244,7 @@ def check_table(checks: Sequence[TaskCheck]) -> Table:
     title = f"Tasks: {sum(not check.problems for check in checks)} of {len(checks)} pass"
     table = Table(title=title, title_justify="left")
     columns = ("task", "contact distance m", "surface gap m", "no policy: survives", "joints rad", "bodies m", "object")
-    for column in (*columns, "reward", "s", "problems"):
+    for column in (*columns, "return", "s", "problems"):
         table.add_column(column, overflow="fold")
     for check in checks:
         distance = " ".join(f"{c.distance.mean():.3f}" if len(c.distance) else "-" for c in check.contacts)
@@ -229,10 +255,11 @@ def check_table(checks: Sequence[TaskCheck]) -> Table:
             return f"{figures[key]['mean']:.3f}{unit}" if key in figures else ""
 
         object_error = shown("object_joint_error", " rad") or shown("object_pos_error", " m")
-        reward = " to ".join(f"{value:.4f}" for value in check.learned) if check.returns else ""
+        learned = check.training
+        gain = "" if learned is None else "{:+.2f} ±{:.2f} of {:.2f}".format(*learned.gain, learned.before.mean())
         table.add_row(
             check.name, distance, gap, shown("survival"), shown("joint_error"), shown("body_error"), object_error,
-            reward, f"{check.seconds:.0f}", "\n".join(check.problems) or "none",
+            gain, f"{check.seconds:.0f}", "\n".join(check.problems) or "none",
         )  # fmt: skip
     return table
 
