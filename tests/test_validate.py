@@ -146,6 +146,24 @@ class TestRobot:
         assert slides(30) == []
         assert slides(36) == [(32, 36)]  # lands at 30, and has two frames
 
+    def test_a_foot_that_pushes_moves_with_what_it_pushes(self):
+        x = np.clip(np.arange(T) - 20, 0, 20) / FPS * 0.3
+        motion = moved(x=x, z=0.06)  # off the floor, toes on a box that stands on it
+        ankle = motion.body_pos_w[:, motion.body_names.index(g1.FEET[0])]
+        toes = max(point[0] for point in g1.FOOT_POINTS) + g1.FOOT_POINT_RADIUS
+        motion = with_box(motion, ankle * [1, 1, 0] + [toes + 0.1, 0, 0.1])
+        scene = {
+            "object": ObjectConfig("box", [{"box": (0.1, 0.1, 0.1)}]),
+            "effectors": [Effector(g1.FEET[0], (toes, 0, 0), (-0.1, 0, 0))],
+        }
+
+        def slides(label: bool) -> list[tuple[int, int]]:
+            labelled = replace(motion, object_contact=np.full((T, 1), label))
+            return [(f.first, f.last) for f in validate_motion(labelled, **scene)["foot_slide"].faults]
+
+        assert slides(True) == []
+        assert slides(False) != []  # it could stand on the box's edge
+
     def test_jump(self):
         report = validate_motion(moved(x=within(30, 59, 0.2)))
         assert report.verdict == "bad"

@@ -129,10 +129,20 @@ def ground(playback: Playback, dynamics: Dynamics, gap: float) -> dict[str, Seri
         "standing_height": Series(floating, ["robot"]),
         "floating": Series(floating, ["robot"]),
         "ground_penetration": Series((-to_ground).clip(min=0), names),
-        "foot_slide": Series(_slide(playback, from_support, gap), g1.FEET),
+        "foot_slide": Series(_slide(playback, _standing_clearance(playback, from_support), gap), g1.FEET),
         "ground_force": Series(dynamics.missing_force[:, None], ["robot"]),
         "centre_of_pressure": Series(dynamics.cop_distance[:, None], ["robot"]),
     }
+
+
+def _standing_clearance(playback: Playback, from_support: np.ndarray) -> np.ndarray:
+    """`from_support`, but a foot that pushes the object, as labels say, does not stand on it. [T, R]"""
+    out = from_support.copy()
+    label = playback.reference.contact.numpy()  # [T, E]
+    for e, effector in enumerate(playback.scene.effectors):
+        own = playback.on_bodies([effector.body])
+        out[:, own] = np.where(label[:, e, None], playback.ground_distance[:, own], out[:, own])
+    return out
 
 
 def _slide(playback: Playback, from_support: np.ndarray, gap: float) -> np.ndarray:
