@@ -66,8 +66,12 @@ def test_the_laptop_preset_is_what_lift_box_has():
     cfg, paper, embedded = load_config("task=walk", "+preset=laptop"), load_config("task=walk"), load_config()
     for node in ("algo", "robot.stiffness", "robot.damping", "reset.state.noise"):
         assert OmegaConf.select(cfg, node) == OmegaConf.select(embedded, node) != OmegaConf.select(paper, node), node
-    for node in ("reward", "termination", "observation", "noise", "randomization", "action", "task"):
+    for node in ("reward", "observation", "noise", "randomization", "action", "task"):
         assert cfg[node] == paper[node]
+    strict = ("root_pose", "body_local_pose")  # end an episode at once
+    for name, node in cfg.termination.items():
+        assert (node == paper.termination[name]) == (name not in strict), name
+        assert name not in strict or node == embedded.termination[name]
 
 
 class TestAblations:
