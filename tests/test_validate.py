@@ -337,7 +337,8 @@ class TestObject:
     def test_contact_point_elsewhere(self, lift_box):
         motion, scene = lift_box
         left, right = scene["effectors"]
-        moved_target = replace(left, target=(0.0, 0.14, 0.3))
+        x, y, z = left.target
+        moved_target = replace(left, target=(x, y, z + 0.25))
         motion = replace(motion, contact_points=None)
         finding = validate_motion(motion, **{**scene, "effectors": [moved_target, right]})["contact_point"]
         assert finding.verdict == "usable"
