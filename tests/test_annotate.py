@@ -281,10 +281,11 @@ class TestContacts:
         compared = agreement(found.object_contact, motion.object_contact)
         assert compared.precision > 0.9
         assert compared.recall > 0.9
-        # on the sides of the box; the fingertips are where the task's targets are
+        # on the box's surface near the task's targets; fingertips 3 cm in its sides are but 2 cm below its top
         middle = found.contact_points[150]
-        np.testing.assert_allclose(np.abs(middle[:, 1]), 0.14, atol=1e-4)
-        np.testing.assert_allclose(middle, [effector.target for effector in scene["effectors"]], atol=0.02)
+        outside = np.abs(middle) - scene["object"].geoms[0]["box"]
+        np.testing.assert_allclose(outside.max(axis=1), 0, atol=1e-4)
+        np.testing.assert_allclose(middle, [effector.target for effector in scene["effectors"]], atol=0.035)
 
     @pytest.mark.parametrize("name", ["move_suitcase", "push_box"])
     def test_labels_of_public_motions(self, public_motions, name):
