@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig
+from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig, g1
 from hdmi.motion.annotate.contacts import ContactCriteria, contact_points, find_contacts
 from hdmi.motion.annotate.overrides import FILE, Overrides
 from hdmi.motion.annotate.trajectory import complete_hinge, complete_trajectory
 from hdmi.motion.check import MotionError
-from hdmi.motion.kinematics import angular_velocity, derivative
+from hdmi.motion.kinematics import angular_velocity, derivative, forward_kinematics
 from hdmi.motion.motion import Motion
 from hdmi.motion.playback import make_playback
 
@@ -137,7 +137,14 @@ def _override_labels(label: np.ndarray, names: Sequence[str], overrides: Overrid
 
 def _body(motion: Motion, name: str) -> tuple[np.ndarray, np.ndarray]:
     if name not in motion.body_names:
-        raise MotionError(f"annotation: body_names lacks {name!r}")
+        if name not in g1.BODY_NAMES or not set(g1.JOINT_NAMES) <= set(motion.joint_names):
+            raise MotionError(f"annotation: body_names lacks {name!r}")
+        # a motion may hold the root and the joints only
+        root_pos, root_quat = _body(motion, g1.BODY_NAMES[0])
+        joints = [motion.joint_names.index(joint) for joint in g1.JOINT_NAMES]
+        pos, quat = forward_kinematics(root_pos, root_quat, motion.joint_pos[:, joints])
+        body = g1.BODY_NAMES.index(name)
+        return pos[:, body], quat[:, body]
     index = motion.body_names.index(name)
     return motion.body_pos_w[:, index].astype(np.float64), motion.body_quat_w[:, index].astype(np.float64)
 
