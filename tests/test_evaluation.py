@@ -192,20 +192,19 @@ def run(cfg: DictConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_an_evaluation_leaves_its_figures_in_the_run_folder(run: Path):
-    result = evaluate_checkpoint(run, num_envs=2, task="lift_box")
+    result = evaluate_checkpoint(run, num_envs=8, task="lift_box")
     assert result.path == run / "eval.json"
     saved = json.loads((run / "eval.json").read_text())
     assert saved == dict(result) == dict(EvalResult.load(run / "eval.json"))
     for name in FIGURES:
         assert saved[name] is None or set(saved[name]) == {"mean", "std"}, name
     assert saved["success_rate"]["mean"] + sum(saved["termination_causes"].values()) == pytest.approx(1)
-    # whoever does not survive the motion has not succeeded, and the reasons are the task's
-    assert 0 < saved["survival"]["mean"] <= 1
-    assert (saved["survival"]["mean"] < 1) == (saved["success_rate"]["mean"] < 1)
+    # some fail within the motion, and the reasons are the task's
+    assert 0 < saved["survival"]["mean"] < 1
     assert saved["terminations"] == ["root_pose", "body_local_pose", "object_pose", "lost_contact"]
     assert set(saved["termination_causes"]) == {"diverged", *saved["terminations"]}
     expected = {"checkpoint": "checkpoints/checkpoint_000003.pt", "iteration": 3, "frames": 96, "task": "lift_box",
-                "motion": "lift_box", "motion_frames": 300, "num_envs": 2, "seed": 0}  # fmt: skip
+                "motion": "lift_box", "motion_frames": 300, "num_envs": 8, "seed": 0}  # fmt: skip
     assert expected.items() <= saved.items()
     assert result.table().row_count == len(result.figures()) + len(saved["termination_causes"])
     assert not list(run.glob("*.partial"))
