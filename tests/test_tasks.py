@@ -112,7 +112,8 @@ class TestConfigs:
     @pytest.mark.parametrize("name", TASKS)
     def test_builds(self, name, motions):
         nodes = [node for node, _ in make_transforms(*built(name, motions))]
-        assert ("reward.object_joint" in nodes) == (name in ARTICULATED)
+        for node in ("reward.object_joint", "termination.object_joint"):
+            assert (node in nodes) == (name in ARTICULATED)
         for node in ("reward.object_pose", "termination.object_pose"):
             assert (node in nodes) == (name not in ARTICULATED | {"walk"})
 
@@ -196,6 +197,20 @@ class TestDoor:
         after = env.step(td.set("action", torch.zeros(env.action_spec.shape)))["next"]
         term = after["reward_terms", "object_joint"]
         torch.testing.assert_close(term, torch.full_like(term, math.exp(-0.6)), atol=0.01, rtol=0)
+
+    def test_a_door_that_stays_shut_ends_the_episode(self, motions):
+        still = ["+ablation=no_randomization", "reset.state.noise=null", "reset.state.start=first"]
+        env = env_of("push_door_hand", motions, 2, "termination.object_joint.min_steps=2", *still)
+        td = env.reset()
+        hinge, qpos = env.base_env.scene.object_hinge_qpos, env.base_env.backend.data("qpos")
+        fired = []
+        for _ in range(2):
+            qpos[:, hinge] = HINGE_ANGLE - torch.tensor([1.15, 1.25])  # 1.2 rad is allowed
+            env.base_env.backend.refresh(torch.arange(2))
+            td = env.step(td.set("action", torch.zeros(env.action_spec.shape)))
+            fired.append(td["next", "termination", "object_joint"].flatten().tolist())
+            td = td["next"]
+        assert fired == [[False, False], [False, True]]
 
     def test_scaled_with_its_hinge_and_contact_points(self, motions):
         env = env_of("push_door_hand", motions, 2, "randomization.object_scale.scale=[0.8,0.8]")

@@ -15,10 +15,12 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
+from tensordict import TensorDictBase
 
 from hdmi.cli import run_folder
 from hdmi.learning import CheckpointError, RunningNorm, Trainer, load_checkpoint, load_policy, save_checkpoint
-from hdmi.learning.checkpoint import checkpoints, claim
+from hdmi.learning.checkpoint import FORMAT, checkpoints, claim
+from hdmi.learning.networks import observation_norm
 from hdmi.learning.policy import export_policy
 from hdmi.learning.trainer import DivergenceError
 
@@ -27,6 +29,7 @@ TINY = [
     "num_envs=4", "algo.frames_per_env=8", "algo.minibatches=2", "algo.epochs=2", "total_frames=128",
     "algo.actor_hidden=[32]", "algo.critic_hidden=[32]", "algo.bf16=false", "checkpoint_interval=2",
     "logger=csv", "video=false", "num_threads=1", "eval_envs=2",
+    "algo.average=0.5",  # of four iterations: the mean is none of them
     "algo.final_kl=0.015",  # as at the beginning: budgets are extended below, and the fall depends on the budget
 ]  # fmt: skip
 
@@ -34,6 +37,11 @@ TINY = [
 def config(*overrides: str) -> DictConfig:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         return compose("config", overrides=[*TINY, *overrides])
+
+
+def parameters(trainer: Trainer) -> list[torch.Tensor]:
+    """Of the actor, and of the mean that leaves the training."""
+    return [*trainer.actor.parameters(), *trainer.averaged.module.parameters()]
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +87,28 @@ class TestRun:
         assert cfg.task.name == "lift_box"
         assert info["frames"] == 128
         observation = torch.randn(3, trainer.sizes["policy"])
-        expected = trainer.actor.module[0].module(observation)[0]
+        expected = trainer.averaged.module.module[0].module(observation)[0]
         torch.testing.assert_close(actor.module[0].module(observation)[0], expected)
+        assert not torch.equal(expected, trainer.actor.module[0].module(observation)[0])
+
+    def test_what_leaves_is_the_mean_of_the_last_weights(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        trainer = Trainer(config(), tmp_path)
+        seen: list[torch.Tensor] = []
+        update = trainer.update
+
+        def noted(batch: TensorDictBase) -> dict[str, float]:
+            figures = update(batch)
+            seen.append(next(trainer.actor.parameters()).detach().clone())
+            return figures
+
+        monkeypatch.setattr(trainer, "update", noted)
+        trainer.run()
+        _, second, third, fourth = seen
+        # shares of the newest: all, all (0.5 * 2 is one), 1 / 1.5, 1 / 2
+        expected = ((second + 2 * third) / 3 + fourth) / 2
+        torch.testing.assert_close(next(trainer.averaged.module.parameters()), expected)
+        mean, actor = observation_norm(trainer.averaged.module), observation_norm(trainer.actor)
+        torch.testing.assert_close(mean.mean, actor.mean, rtol=0, atol=0)
 
 
 class TestResume:
@@ -91,7 +119,7 @@ class TestResume:
         second = Trainer(config(f"resume={tmp_path}"), tmp_path)
         assert second.iteration == 2
         second.run()
-        for a, b in zip(straight.actor.parameters(), second.actor.parameters(), strict=True):
+        for a, b in zip(parameters(straight), parameters(second), strict=True):
             torch.testing.assert_close(a, b, rtol=0, atol=0)
         rows = list(csv.DictReader((tmp_path / "metrics.csv").open()))
         assert [int(row["iteration"]) for row in rows] == [1, 2, 3, 4]
@@ -123,7 +151,7 @@ class TestResume:
         straight = Trainer(config(budget), tmp_path / "straight")
         straight.run()
         assert resumed.iteration == straight.iteration == reached + 1
-        for a, b in zip(straight.actor.parameters(), resumed.actor.parameters(), strict=True):
+        for a, b in zip(parameters(straight), parameters(resumed), strict=True):
             torch.testing.assert_close(a, b, rtol=0, atol=0)
 
     def test_refuses_another_task(self, trained: tuple[Trainer, Path], tmp_path: Path) -> None:
@@ -152,7 +180,7 @@ class TestCheckpoint:
             def __reduce__(self) -> tuple:
                 return (Path.touch, (tmp_path / "executed",))
 
-        torch.save({"format": 2, "x": Hostile()}, tmp_path / "checkpoint_000001.pt")
+        torch.save({"format": FORMAT, "x": Hostile()}, tmp_path / "checkpoint_000001.pt")
         with pytest.raises(CheckpointError):
             load_checkpoint(tmp_path)
         assert not (tmp_path / "executed").exists()

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from filelock import FileLock, Timeout
 
-FORMAT = 2
+FORMAT = 3
 
 
 class CheckpointError(RuntimeError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
+from torch.optim.swa_utils import AveragedModel
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.utils import KLAdaptiveLR
 from torchrl.objectives.value import GAE
@@ -41,11 +43,16 @@ class Trainer:
     Each iteration collects `frames_per_env` steps of `num_envs` environments, estimates advantages by GAE
     (bootstrapping through truncations), makes `epochs` passes of minibatch updates, and then updates the observation
     moments for the next collection. The actor's learning rate follows the policy's KL divergence, which is to fall
-    from `desired_kl` to `final_kl` over `total_frames`, so that the policy settles.
+    from `desired_kl` to `final_kl` over `total_frames`, so that the policy settles. What is evaluated and leaves the
+    training is the mean of the actor's weights over the last iterations (`average` of those so far), which is steadier
+    than any of them.
 
     Args:
         cfg: the whole config.
         folder: of the run; checkpoints, metrics.csv and config.yaml are written there.
+
+    Attributes:
+        actor: that acts in training. averaged: `averaged.module` is the policy that leaves it.
     """
 
     def __init__(self, cfg: DictConfig, folder: Path):
@@ -71,6 +78,7 @@ class Trainer:
         }
         self.actor, self.critic = make_networks(cfg, self.sizes, self.device)
         algo = cfg.algo
+        self.averaged = AveragedModel(self.actor, avg_fn=partial(_recent_mean, share=algo.average))
         self.loss = ClipPPOLoss(
             self.actor,
             self.critic,
@@ -138,6 +146,7 @@ class Trainer:
                 for key, value in losses.items():
                     sums[key] = sums.get(key, 0.0) + value
         self._update_moments(batch)
+        self.averaged.update_parameters(self.actor)
         stats = {key: value / max(count, 1) for key, value in sums.items()}
         target, error = data["value_target"], data["value_target"] - data["state_value"]
         stats["explained_variance"] = float(1 - error.var() / (target.var() + 1e-8))
@@ -256,7 +265,7 @@ class Trainer:
         from hdmi.evaluation import evaluate_policy  # evaluation depends on learning, not the other way round
 
         with torch.random.fork_rng():
-            result = evaluate_policy(self.actor, self.cfg, self.cfg.eval_envs, task=self.task)
+            result = evaluate_policy(self.averaged.module, self.cfg, self.cfg.eval_envs, task=self.task)
         return {f"eval/{k}": v["mean"] for k, v in result.items() if isinstance(v, dict) and "mean" in v}
 
     # -- checkpoints ------------------------------------------------------------------------------------------
@@ -276,7 +285,9 @@ class Trainer:
             "iteration": self.iteration,
             "frames": self.frames,
             "elapsed": self.elapsed,
-            "actor": self.actor.state_dict(),
+            "actor": self.averaged.module.state_dict(),
+            "averaged_iterations": self.averaged.n_averaged,
+            "training_actor": self.actor.state_dict(),
             "critic": self.critic.state_dict(),
             "actor_optim": self.actor_optim.state_dict(),
             "critic_optim": self.critic_optim.state_dict(),
@@ -311,7 +322,9 @@ class Trainer:
                 f"there are {self.ranks.size}"
             )
         own = state["ranks"][self.ranks.rank]
-        self.actor.load_state_dict(state["actor"])
+        self.actor.load_state_dict(state["training_actor"])
+        self.averaged.module.load_state_dict(state["actor"])
+        self.averaged.n_averaged.copy_(state["averaged_iterations"])
         self.critic.load_state_dict(state["critic"])
         self.actor_optim.load_state_dict(state["actor_optim"])
         self.critic_optim.load_state_dict(state["critic_optim"])
@@ -335,6 +348,11 @@ class _Objective(torch.nn.Module):
 def _parallel(objective: _Objective) -> DistributedDataParallel:
     # running moments are averaged where they are updated
     return DistributedDataParallel(objective, broadcast_buffers=False)
+
+
+def _recent_mean(mean: Tensor, latest: Tensor, count: Tensor | int, share: float) -> Tensor:
+    """A running mean over about the last `share` of the `count` values so far and the latest."""
+    return mean + (latest - mean) / max(1.0, share * (int(count) + 1))
 
 
 def summarize(batch: TensorDictBase) -> dict[str, float]:
