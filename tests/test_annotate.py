@@ -362,6 +362,19 @@ class TestContacts:
         with pytest.raises(MotionError, match="needs contacts"):
             complete_object(bare, object=scene["object"], effectors=scene["effectors"], overrides=overrides)
 
+    def test_hands_come_from_joints_in_any_order(self, lift_box):
+        motion, scene = lift_box
+        assert LEFT not in motion.body_names
+        turned = replace(
+            motion,
+            joint_names=motion.joint_names[::-1],
+            joint_pos=motion.joint_pos[:, ::-1].copy(),
+            joint_vel=motion.joint_vel[:, ::-1].copy(),
+        )
+        made, again = (annotate_motion(m, **scene) for m in (motion, turned))
+        np.testing.assert_array_equal(made.object_contact, again.object_contact)
+        np.testing.assert_allclose(made.contact_points, again.contact_points, atol=1e-9)
+
     def test_effectors_that_cannot_touch(self, lift_box):
         motion, scene = lift_box
         effectors = [Effector("left_wrist_roll_link")]
