@@ -181,7 +181,8 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
     spec.visual.headlight.diffuse = [0.35, 0.35, 0.35]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1920, 1080
-    spec.visual.quality.shadowsize = 2048
+    spec.visual.quality.shadowsize = 4096
+    spec.visual.map.shadowclip = 8.0  # the edge of what the light sees is speckled: out of view
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
