@@ -223,7 +223,7 @@ def _train(cfg: DictConfig, task: Task) -> Training:
         trainer = Trainer(cfg, Path(folder))
         before = returns(cfg, task, trainer.actor)
         trainer.run()
-        return Training(before, returns(cfg, task, trainer.actor))
+        return Training(before, returns(cfg, task, trainer.averaged.module))
 
 
 def returns(cfg: DictConfig, task: Task, actor: torch.nn.Module) -> np.ndarray:
