@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig, g1
+from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig
 from hdmi.motion.annotate.contacts import ContactCriteria, contact_points, find_contacts
 from hdmi.motion.annotate.overrides import FILE, Overrides
 from hdmi.motion.annotate.trajectory import complete_hinge, complete_trajectory
 from hdmi.motion.check import MotionError
-from hdmi.motion.kinematics import angular_velocity, derivative, forward_kinematics
+from hdmi.motion.kinematics import angular_velocity, derivative
 from hdmi.motion.motion import Motion
 from hdmi.motion.playback import make_playback
+from hdmi.motion.reference import complete_robot
 
 _GIVE_POSE = f"give its pose in at least one frame, under `object` in {FILE}"
 
@@ -71,22 +72,24 @@ def complete_object(
     """The motion with the object's trajectory, and its hinge's if it has one, made from keyframes.
 
     Contacts are the overrides'; for an effector that they do not name, the motion's labels; an object that is fixed
-    needs none. An articulated object's
-    base follows its own keyframes only: what is in the hands is its link.
+    needs none. An articulated object's base follows its own keyframes only: what is in the hands is its link. Hands
+    that the motion lacks come from its joints, see `complete_robot`.
 
     Raises:
-        MotionError: without contacts of an object that moves, or without keyframes of the object's pose where the
-            motion lacks it.
+        MotionError: without contacts of an object that moves, without keyframes of the object's pose where the
+            motion lacks it, or if the robot cannot be completed.
     """
     names = [effector.body for effector in effectors]
     if object.fixed_base and not overrides.hinge:
         contact = np.zeros((motion.num_frames, len(names)), bool)  # nothing that touches it moves it
     else:
         contact = _given_labels(motion, names, overrides)
+    robot = complete_robot(motion)
+    hands = [_body(robot, name) for name in names]
     hand_pos = np.stack(
-        [_body(motion, e.body)[0] + _rotate(_body(motion, e.body)[1], np.asarray(e.point, float)) for e in effectors], 1
+        [pos + _rotate(quat, np.asarray(e.point, float)) for (pos, quat), e in zip(hands, effectors, strict=True)], 1
     )
-    hand_quat = np.stack([_body(motion, name)[1] for name in names], axis=1)
+    hand_quat = np.stack([quat for _, quat in hands], axis=1)
     if overrides.object:
         carried = contact if object.hinge is None else np.zeros_like(contact)
         pos, quat = complete_trajectory(overrides.object, hand_pos, hand_quat, carried)
@@ -137,14 +140,7 @@ def _override_labels(label: np.ndarray, names: Sequence[str], overrides: Overrid
 
 def _body(motion: Motion, name: str) -> tuple[np.ndarray, np.ndarray]:
     if name not in motion.body_names:
-        if name not in g1.BODY_NAMES or not set(g1.JOINT_NAMES) <= set(motion.joint_names):
-            raise MotionError(f"annotation: body_names lacks {name!r}")
-        # a motion may hold the root and the joints only
-        root_pos, root_quat = _body(motion, g1.BODY_NAMES[0])
-        joints = [motion.joint_names.index(joint) for joint in g1.JOINT_NAMES]
-        pos, quat = forward_kinematics(root_pos, root_quat, motion.joint_pos[:, joints])
-        body = g1.BODY_NAMES.index(name)
-        return pos[:, body], quat[:, body]
+        raise MotionError(f"annotation: body_names lacks {name!r}")
     index = motion.body_names.index(name)
     return motion.body_pos_w[:, index].astype(np.float64), motion.body_quat_w[:, index].astype(np.float64)
 
