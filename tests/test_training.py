@@ -110,6 +110,18 @@ class TestRun:
         mean, actor = observation_norm(trainer.averaged.module), observation_norm(trainer.actor)
         torch.testing.assert_close(mean.mean, actor.mean, rtol=0, atol=0)
 
+    def test_that_mean_is_what_is_evaluated(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        trainer = Trainer(config("eval_interval=4"), tmp_path)
+        evaluated: list[torch.nn.Module] = []
+
+        def noted(actor: torch.nn.Module, *args: object, **kwargs: object) -> dict[str, float]:
+            evaluated.append(actor)
+            return {}
+
+        monkeypatch.setattr("hdmi.evaluation.evaluate_policy", noted)
+        trainer.run()
+        assert evaluated == [trainer.averaged.module]
+
 
 class TestResume:
     def test_continues_exactly(self, trained: tuple[Trainer, Path], tmp_path: Path) -> None:

@@ -286,7 +286,6 @@ class Trainer:
             "frames": self.frames,
             "elapsed": self.elapsed,
             "actor": self.averaged.module.state_dict(),
-            "averaged_iterations": self.averaged.n_averaged,
             "training_actor": self.actor.state_dict(),
             "critic": self.critic.state_dict(),
             "actor_optim": self.actor_optim.state_dict(),
@@ -324,11 +323,11 @@ class Trainer:
         own = state["ranks"][self.ranks.rank]
         self.actor.load_state_dict(state["training_actor"])
         self.averaged.module.load_state_dict(state["actor"])
-        self.averaged.n_averaged.copy_(state["averaged_iterations"])
         self.critic.load_state_dict(state["critic"])
         self.actor_optim.load_state_dict(state["actor_optim"])
         self.critic_optim.load_state_dict(state["critic_optim"])
         self.iteration, self.frames, self.elapsed = state["iteration"], state["frames"], state["elapsed"]
+        self.averaged.n_averaged.fill_(self.iteration)
         self.collector.load_state_dict(own)
         torch.set_rng_state(own["rng"].cpu())
 
