@@ -195,6 +195,8 @@ def main(cfg: DictConfig) -> None:
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(cfg, Path(folder))
         env, policy = trainer.env, trainer.actor
+        if env.base_env.num_envs != cfg.num_envs:  # workers simulate a share each
+            env = make_env(cfg, task=trainer.task)
         raw = RawPhysics(env, cfg)
         with torch.no_grad():
             carry = env.reset()
@@ -229,6 +231,7 @@ def main(cfg: DictConfig) -> None:
         "env_sps": median(env_sps),
         "env_ratio": median(e / r for e, r in zip(env_sps, raw_sps, strict=True)),
         "collect_sps": median(collect),
+        "collect_ratio": median(c / r for c, r in zip(collect, raw_beside, strict=True)),
         "learn_sps": median(learn),
         "train_sps": median(train),
         "train_ratio": median(t / r for t, r in zip(train, raw_beside, strict=True)),
