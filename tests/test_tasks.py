@@ -20,7 +20,7 @@ import trimesh
 from mocks import CONF, load_config
 from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import check_env_specs
+from torchrl.envs.utils import ExplorationType, check_env_specs, exploration_type
 
 from hdmi.assets import default_joint_pos, g1
 from hdmi.build import ConfigError, Task, make_env, make_task, make_transforms
@@ -302,6 +302,19 @@ class TestCheck:
         assert first.shape == (8,)
         assert np.ptp(first) > 0
         assert np.array_equal(first, second)
+
+    def test_return_is_that_of_the_policy_with_its_noise(self):
+        cfg = load_config()
+        modes = set()
+
+        class Agent(BlindAgent):
+            def forward(self, tensordict):
+                modes.add(exploration_type())
+                return super().forward(tensordict)
+
+        with patch.multiple("hdmi.evaluation.tasks", _RETURN_ENVS=2, _RETURN_STEPS=2):
+            returns(cfg, make_task(cfg), Agent("zero", cfg.action.history.size))
+        assert modes == {ExplorationType.RANDOM}
 
     def test_a_negative_number_of_frames_is_refused(self):
         with pytest.raises(ConfigError, match="frames: expected 0 or more, got -1"):

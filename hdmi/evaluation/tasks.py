@@ -174,9 +174,9 @@ def check_task(
     2. The reference, replayed without physics, meets the object where its labels say: end effectors are on average as
        close to their contact points as the lost-contact termination asks for.
     3. Servos that follow the reference give finite survival and errors.
-    4. A training of `frames` control steps improves the return: both policies play the first steps of the same
-       episodes (start frames, perturbations and randomization drawn alike), and the mean difference is at least
-       twice its standard error. 0 skips it.
+    4. A training of `frames` control steps improves the return that PPO maximizes, that of the policy with its
+       exploration noise: both policies play the first steps of the same episodes (start frames, perturbations and
+       randomization drawn alike), and the mean difference is at least twice its standard error. 0 skips it.
 
     Raises:
         ConfigError, MotionError: if the task or its motion does not exist or cannot be used.
@@ -223,12 +223,12 @@ def _train(cfg: DictConfig, task: Task) -> Training:
         trainer = Trainer(cfg, Path(folder))
         before = returns(cfg, task, trainer.actor)
         trainer.run()
-        return Training(before, returns(cfg, task, trainer.averaged.module))
+        return Training(before, returns(cfg, task, trainer.actor))
 
 
 def returns(cfg: DictConfig, task: Task, actor: torch.nn.Module) -> np.ndarray:
-    """Sum of rewards over the first steps of episodes that are the same in each call, acting without noise. [N]"""
-    with torch.random.fork_rng(), torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+    """Sum of rewards over the first steps of episodes that begin alike in each call, acting with noise. [N]"""
+    with torch.random.fork_rng(), torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         torch.manual_seed(cfg.seed)
         env = make_env(cfg, _RETURN_ENVS, task)
         env.set_seed(cfg.seed)
