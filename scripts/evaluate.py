@@ -6,7 +6,7 @@
 `checkpoint` is a run folder (its newest checkpoint counts) or a checkpoint file. `terminations` are those that end
 an episode as a failure: `all` that the policy was trained with, `none`, or a list such as
 [root_pose,object_pose]. An agent instead of a checkpoint shows what a task is without a policy, in the environment of
-the default config; its figures are written only where `out` says.
+the default config. Its figures, and those of an exported policy, are written only where `out` says.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Options:
     motion_root: str | None = None  # instead of the training's
     num_threads: int | None = None  # of physics, instead of the training's
     sim: str | None = None  # engine, cpu or gpu; for a checkpoint: instead of the training's
-    out: str | None = None  # instead of eval.json in the run folder
+    out: str | None = None  # file to write; of a run: instead of its eval.json
 
 
 def evaluate_agent(options: Options, terminations: list[str] | None) -> EvalResult:

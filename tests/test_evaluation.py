@@ -314,6 +314,9 @@ def test_an_exported_policy_acts_like_its_checkpoint(
     assert "critic" not in load_checkpoint(out)
     figures = json.loads((out / "eval.json").read_text())
     assert (figures["checkpoint"], figures["num_envs"], figures["frames"]) == ("policy.pt", 2, 96)
+    before = (out / "eval.json").read_bytes()
+    assert evaluate_checkpoint(out, num_envs=1).path is None  # its figures stay those of its card
+    assert (out / "eval.json").read_bytes() == before
     card = (out / "README.md").read_text()
     assert card == capsys.readouterr().out[:-1]
     assert "after 96 frames, 2 minutes" in card

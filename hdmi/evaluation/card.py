@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from hdmi.evaluation.protocol import UNITS, EvalResult, evaluate_checkpoint
 from hdmi.evaluation.video import render_checkpoint
 from hdmi.learning import export_policy, load_checkpoint
+from hdmi.learning.checkpoint import POLICY_FILE
 
 _SIZE = (240, 320)  # of the video, pixels
 
@@ -29,10 +30,10 @@ def export(run_or_checkpoint: str | Path, folder: str | Path, num_envs: int = 25
         OSError: if a file cannot be written.
     """
     folder = Path(folder)
-    policy = export_policy(run_or_checkpoint, folder / "policy.pt")
+    policy = export_policy(run_or_checkpoint, folder / POLICY_FILE)
     state = load_checkpoint(policy)
     OmegaConf.save(OmegaConf.create(state["config"]), folder / "config.yaml")
-    result = evaluate_checkpoint(policy, num_envs, seed=seed)
+    result = evaluate_checkpoint(policy, num_envs, seed=seed, out=folder / "eval.json")
     render_checkpoint(policy, seed=seed, size=_SIZE)
     (folder / "README.md").write_text(_card(state, result, folder, seed), encoding="utf-8")
     return folder
@@ -59,7 +60,7 @@ def _card(state: dict, result: EvalResult, folder: Path, seed: int) -> str:
         f"python scripts/play.py checkpoint={folder}",
         "```",
         "",
-        f"`policy.pt` holds the weights and the observations' normalization ({_megabytes(folder / 'policy.pt')} MB); "
+        f"`policy.pt` holds the weights and the observations' normalization ({_megabytes(folder / POLICY_FILE)} MB); "
         "`config.yaml` is the whole config of the training, `eval.json` the evaluation from the first frame, under the "
         "training's reset noise and randomization:",
         "",

@@ -19,7 +19,7 @@ from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
 from hdmi.build import ConfigError, Task, make_env, make_task
 from hdmi.evaluation.agents import choose_engine
-from hdmi.learning.checkpoint import CheckpointError
+from hdmi.learning.checkpoint import POLICY_FILE, CheckpointError
 from hdmi.learning.policy import load_policy
 from hdmi.motion import Reference
 from hdmi.transforms import ReferenceStateInitialization
@@ -361,11 +361,12 @@ def evaluate_checkpoint(
     num_threads: int | None = None,
     sim: str | None = None,
 ) -> EvalResult:
-    """Evaluates a checkpoint by `evaluate_policy` and writes eval.json.
+    """Evaluates a checkpoint by `evaluate_policy` and writes eval.json, which its result then names as `path`.
 
     Args:
         run_or_checkpoint: a run folder (its newest checkpoint counts) or a checkpoint file.
-        out: file to write; None for eval.json in the run folder.
+        out: file to write; None for eval.json in the run folder, but for an exported policy none: its eval.json is the
+            one that its card quotes.
         task: that the checkpoint must be of.
         motion_root, num_threads: instead of the training's.
         sim: engine (`cpu`, `gpu`) instead of the training's.
@@ -391,7 +392,10 @@ def evaluate_checkpoint(
         "frames": info["frames"],
     }
     result = EvalResult({**values, **origin})
-    result.save(folder / "eval.json" if out is None else out)
+    if out is None and file.name != POLICY_FILE:
+        out = folder / "eval.json"
+    if out is not None:
+        result.save(out)
     return result
 
 

@@ -13,6 +13,7 @@ import torch
 from filelock import FileLock, Timeout
 
 FORMAT = 3
+POLICY_FILE = "policy.pt"  # of an exported policy
 
 
 class CheckpointError(RuntimeError):
@@ -83,10 +84,10 @@ def find_checkpoint(path: str | Path) -> Path:
     if path.is_file():
         return path
     found = [*checkpoints(path), *checkpoints(path / "checkpoints")] if path.is_dir() else []
-    if not found and (path / "policy.pt").is_file():
-        return path / "policy.pt"
+    if not found and (path / POLICY_FILE).is_file():
+        return path / POLICY_FILE
     if not found:
-        raise CheckpointError(f"{path}: no checkpoint_*.pt or policy.pt there")
+        raise CheckpointError(f"{path}: no checkpoint_*.pt or {POLICY_FILE} there")
     return found[-1]
 
 
