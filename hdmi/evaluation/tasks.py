@@ -28,7 +28,7 @@ from hdmi.motion import MotionError, find_motion, load_motion, make_playback
 from hdmi.motion.annotate import intervals
 
 _SPEC_ENVS, _EPISODES = 2, 16
-_RETURN_ENVS, _RETURN_STEPS = 256, 64  # episodes before and after a training, and control steps of each
+_RETURN_ENVS, _RETURN_STEPS = 256, 96  # episodes before and after a training, and control steps of each
 _DISTANCE = 3.2  # of the camera, m
 
 
@@ -166,7 +166,7 @@ class TaskCheck:
 
 
 def check_task(
-    name: str, motion_root: str | None = None, frames: int = 65_536, num_envs: int = 128, num_threads: int = 0
+    name: str, motion_root: str | None = None, frames: int = 65_536, num_envs: int = 64, num_threads: int = 0
 ) -> TaskCheck:
     """Smoke test of a task: its environment, its reference, no policy, and a short training.
 
