@@ -1,7 +1,7 @@
 """Lists the tasks, checks them, or renders a picture of each.
 
     python scripts/tasks.py [motion_root=FOLDER]
-    python scripts/tasks.py check [NAME ...] [frames=65536] [num_envs=64] [jobs=2] [motion_root=FOLDER]
+    python scripts/tasks.py check [NAME ...] [frames=65536] [num_envs=128] [jobs=2] [motion_root=FOLDER]
     python scripts/tasks.py gallery [NAME ...] [out=docs/images/tasks] [motion_root=FOLDER]
 
 References are those that ship with the package, or those under `motion_root`. `check` builds each task, replays its
@@ -36,7 +36,7 @@ class Options:
 
     motion_root: str | None = None
     frames: int = 65_536
-    num_envs: int = 64
+    num_envs: int = 128
     jobs: int = 2
     out: str = "docs/images/tasks"
 

@@ -166,7 +166,7 @@ class TaskCheck:
 
 
 def check_task(
-    name: str, motion_root: str | None = None, frames: int = 65_536, num_envs: int = 64, num_threads: int = 0
+    name: str, motion_root: str | None = None, frames: int = 65_536, num_envs: int = 128, num_threads: int = 0
 ) -> TaskCheck:
     """Smoke test of a task: its environment, its reference, no policy, and a short training.
 
