@@ -41,6 +41,12 @@ class TestBackend:
             [[0, 1, 1, 1], [0, 0, 1, 1], [0, 0, 0, 1]],  # delays: each world changes once
             [[0, 1, 2, 3], [0, 0, 1, 0], [0, 0, 0, 0]],  # anything
             [[0], [1], [2]],
+            # several control steps: targets that arrive late, a schedule of its own between them, anything
+            [
+                [0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 2],
+                [0, 0, 0, 1, 2, 3, 0, 1, 1, 1, 3, 3],
+                [3, 2, 1, 0, 1, 1, 2, 2, 3, 3, 3, 3],
+            ],
         ],
     )
     def test_steps_as_mujoco_does(self, robot_scene, runs):
@@ -50,7 +56,8 @@ class TestBackend:
         backend = BatchBackend(robot_scene.model, len(runs), num_threads=1)
         backend.data("qpos")[:] = torch.from_numpy(robot_scene.default_qpos)
         backend.refresh(torch.arange(len(runs)))
-        backend.step(controls)
+        for control_step in controls.split(4, dim=1):
+            backend.step(control_step)
         for world, sequence in enumerate(controls):
             alone = step_alone(robot_scene, sequence)
             for field in ("time", "qpos", "qvel", "xpos", "cvel", "actuator_force"):

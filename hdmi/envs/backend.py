@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import warnings
 from typing import Protocol
 
@@ -145,8 +144,8 @@ class LiveBackend:
 class BatchBackend(LiveBackend):
     """MuJoCo's `Batch`: worlds stepped by a pool of C threads on the CPU.
 
-    Controls that change within a control step cost nothing: they are laid out in MuJoCo's history of each actuator,
-    which then acts one control step late on the schedule instead of on `ctrl`.
+    Controls that change within a control step cost next to nothing: MuJoCo's actuators keep a history of `ctrl`, and
+    a delay per world and actuator makes them follow the last step's control for its first physics steps.
 
     Args:
         num_threads: 0 for all processors.
@@ -159,15 +158,14 @@ class BatchBackend(LiveBackend):
         slots = set(model.actuator_history[:, 0].tolist())
         if len(slots) != 1 or 0 in slots:
             raise ValueError(
-                "model: the controls of one control step are scheduled in its actuators' history; "
+                "model: the controls of one control step are kept in its actuators' history; "
                 f"all need nsample = decimation, they have {sorted(slots)}"
             )
         self._slots = slots.pop()
         self._timestep = model.opt.timestep
-        model = copy.copy(model)
-        model.actuator_delay[:] = self._slots * self._timestep
         # persistent: otherwise a masked forward gives reset worlds another world's contact forces
         self._batch = Batch(model, num_worlds, num_threads, persistent=True)
+        self._delay = self._expand("actuator_delay")  # s [N, nu]
         self.num_worlds = num_worlds
         self.device = torch.device("cpu")
 
@@ -184,17 +182,31 @@ class BatchBackend(LiveBackend):
         num_steps = controls.shape[1]
         if num_steps > self._slots:
             raise ValueError(f"{num_steps} controls in a step; the model's actuators have room for {self._slots}")
-        self._schedule(slice(None), controls.detach())
+        self._schedule(controls.detach().double())
         # A step that stops at VEL has positions and velocities of the new state, forces of the last physics step, and
         # the next one continues from there: Batch.rollout would compute these stages twice.
         self._batch.step(nstep=num_steps, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
-    def _schedule(self, worlds: Tensor | slice, controls: Tensor) -> None:
-        """Writes the controls of the next physics steps where delayed actuators will find them. [n, S, nu]"""
+    def _schedule(self, controls: Tensor) -> None:
+        """Makes the actuators follow the controls of the next physics steps. [N, S, nu]"""
+        ctrl, last = self.data("ctrl"), controls[:, -1]
+        waiting = (controls != last.unsqueeze(1)).sum(1)  # physics steps before an actuator turns to the last control
+        early = torch.arange(controls.shape[1]).unsqueeze(-1) < waiting.unsqueeze(1)  # [N, S, nu]
+        follows = (controls == torch.where(early, ctrl.unsqueeze(1), last.unsqueeze(1))).flatten(1).all(-1)
+        # half a physics step early, so that rounding cannot choose a neighbour
+        self._delay.copy_((waiting - 0.5).clamp(min=0) * self._timestep)
+        ctrl.copy_(last)
+        if not follows.all():
+            # Any other schedule is written into the history. That is part of the state: MuJoCo then computes anew
+            # what it had kept of the last step, a quarter of the work.
+            worlds = (~follows).nonzero().squeeze(-1)
+            self._write_history(worlds, controls[worlds])
+            self._delay[worlds] = self._slots * self._timestep
+
+    def _write_history(self, worlds: Tensor, controls: Tensor) -> None:
+        """Writes controls where actuators delayed by all slots find them in the next physics steps. [n, S, nu]"""
         missing = self._slots - controls.shape[1]
-        plan = torch.cat([controls, controls[:, -1:].expand(-1, missing, -1)], dim=1).double()
-        self.data("ctrl")[worlds] = plan[:, -1]
-        # half a step early, so that rounding cannot choose a neighbour
+        plan = torch.cat([controls, controls[:, -1:].expand(-1, missing, -1)], dim=1)
         offsets = (torch.arange(self._slots) - 0.5 - self._slots) * self._timestep
         times = (self.data("time")[worlds].unsqueeze(-1) + offsets).unsqueeze(1).expand(-1, plan.shape[-1], -1)
         head = torch.tensor([0.0, self._slots - 1.0], dtype=torch.float64)  # the user's value; place of the newest
@@ -208,7 +220,7 @@ class BatchBackend(LiveBackend):
         worlds = _numbers(worlds)
         if not len(worlds):
             return
-        self._schedule(worlds, self.data("ctrl")[worlds].unsqueeze(1))
+        self._write_history(worlds, self.data("ctrl")[worlds].unsqueeze(1))
         self._batch.forward(worlds.numpy())
 
     def commit_model(self, worlds: Tensor) -> None:
