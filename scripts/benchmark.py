@@ -34,7 +34,7 @@ from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 from hdmi.assets import Scene
 from hdmi.build import Task, backend_of, make_env, make_transforms
 from hdmi.console import make_console
-from hdmi.envs import BatchBackend
+from hdmi.envs import BatchBackend, torch_threads
 from hdmi.evaluation.comparison import mjlab_speed, mujoco_env_speed
 from hdmi.learning import Trainer
 
@@ -118,7 +118,7 @@ def step_env(
     if raw is not None:
         raw.begin()
     for _ in range(count):
-        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM), torch_threads(env.base_env.num_envs):
             carry = policy(carry)
         start = now()
         _, carry = env.step_and_maybe_reset(carry)

@@ -13,6 +13,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from hdmi.build import make_env
 from hdmi.envs import BatchBackend, RowResetEnv
+from hdmi.learning.collectors import WorldCollector
 
 DETERMINISTIC = ("+ablation=no_randomization", "reset.state.start=first", "~reset.state.noise")
 
@@ -137,6 +138,25 @@ def test_torch_threads_are_few_while_it_steps_and_as_before_afterwards(monkeypat
     try:
         start["done"][1] = True
         advance(env, env.maybe_reset(start), 1)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [1, 1]
+
+
+def test_a_policy_has_no_more_threads_than_the_environment_while_experience_is_collected():
+    env, seen = env_of(2), []
+
+    def policy(tensordict: TensorDictBase) -> TensorDictBase:
+        seen.append(torch.get_num_threads())
+        return tensordict.set("action", env.action_spec.zero())
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        batches = iter(WorldCollector(env, policy, frames_per_batch=4, total_frames=-1))
+        seen.clear()  # TorchRL has asked the policy for its outputs
+        next(batches)
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)

@@ -14,8 +14,12 @@ _ENVS_PER_THREAD = 1024
 
 
 @contextmanager
-def _torch_threads(num_envs: int) -> Iterator[None]:
-    """Lowers torch's threads to what tensors of so many rows can use, without changing them for good."""
+def torch_threads(num_envs: int) -> Iterator[None]:
+    """Lowers torch's threads to what tensors of so many rows can use, without changing them for good.
+
+    Torch's threads wait for work by spinning, for milliseconds, on processors that physics wants. While worlds are
+    stepped, a policy between the steps should therefore have no more of them than the environment.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(min(before, -(-num_envs // _ENVS_PER_THREAD)))
     try:
@@ -31,8 +35,7 @@ class RowResetEnv(TransformedEnv):
     then costs twice. Here base environment and transforms are given the n rows, with their numbers
     under `worlds` int64 [n], and results are written into copies of the others' tensors. `reset` itself is unchanged.
 
-    Torch's threads wait for work by spinning, on processors that physics wants; while it steps they are therefore
-    limited to one per 1024 environments.
+    While it steps, torch has one thread per 1024 environments; see `torch_threads`.
 
     `compile_transforms` compiles the stack with `torch.compile`.
 
@@ -73,7 +76,7 @@ class RowResetEnv(TransformedEnv):
         return self.transform._reset(tensordict, tensordict_reset)
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        with _torch_threads(self.base_env.batch_size.numel()):
+        with torch_threads(self.base_env.batch_size.numel()):
             return super().step(tensordict)
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -82,7 +85,7 @@ class RowResetEnv(TransformedEnv):
         worlds = tensordict.get("_reset").reshape(-1).nonzero().squeeze(-1)
         part = tensordict[worlds].set("worlds", worlds)
         tensordict = tensordict.exclude("_reset")
-        with _torch_threads(len(worlds)):
+        with torch_threads(len(worlds)):
             part = self.transform._reset_env_preprocess(part)
             # a kernel for n rows would be compiled anew for one
             reset = self._reset_transforms if len(worlds) > 1 else self.transform._reset

@@ -21,7 +21,7 @@ from torchrl.collectors import BaseCollector, Collector, MultiSyncCollector
 from torchrl.modules import ProbabilisticActor
 
 from hdmi.build import ConfigError, Task, make_env
-from hdmi.envs import RowResetEnv
+from hdmi.envs import RowResetEnv, torch_threads
 from hdmi.learning.checkpoint import CheckpointError
 
 _SEED_STRIDE = 2**12  # between workers; ranks are 2**20 apart
@@ -32,9 +32,16 @@ class WorkerError(RuntimeError):
 
 
 class WorldCollector(Collector):
-    """TorchRL's collector with a state that determines its future: worlds, transforms, random numbers."""
+    """TorchRL's collector with a state that determines its future: worlds, transforms, random numbers.
+
+    The policy gets no more of torch's threads than the environment; see `torch_threads`.
+    """
 
     _carrier: TensorDictBase  # from batch to batch; TorchRL gives no access to it
+
+    def rollout(self) -> TensorDictBase:
+        with torch_threads(self.env.batch_size.numel()):
+            return super().rollout()
 
     def state_dict(self) -> dict[str, Any]:  # type: ignore[override]
         """`rng` of the process and its GPU, `env` and `transforms`, and the `carrier` [N] of the next step."""

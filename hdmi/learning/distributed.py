@@ -62,7 +62,8 @@ class Ranks:
     def moments(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and population variance of the first dimension over all ranks' values. [n, ...] -> [...], [...]"""
         mean = self.mean(values.mean(0))
-        return mean, self.mean((values - mean).square().mean(0))
+        centred = values - mean
+        return mean, self.mean(centred.mul_(centred).mean(0))  # in place: all observations of a batch
 
     def mean_row(self, row: dict[str, float]) -> dict[str, float]:
         """Mean of each figure over the ranks that have it."""
