@@ -28,7 +28,7 @@ from hdmi.motion import MotionError, find_motion, load_motion, make_playback
 from hdmi.motion.annotate import intervals
 
 _SPEC_ENVS, _EPISODES = 2, 16
-_RETURN_ENVS, _RETURN_STEPS = 256, 96  # episodes before and after a training, and control steps of each
+_RETURN_ENVS, _RETURN_STEPS = 512, 96  # episodes before and after a training, and control steps of each
 _DISTANCE = 3.2  # of the camera, m
 
 
