@@ -65,6 +65,21 @@ class TestBackend:
                 got = backend.data(field)[world].numpy()
                 np.testing.assert_array_equal(got, np.asarray(getattr(alone, field)).reshape(got.shape), field)
 
+    def test_late_controls_leave_the_state_alone(self, robot_scene, monkeypatch: pytest.MonkeyPatch):
+        """What is written into the history makes MuJoCo compute anew what it had kept: only other schedules are."""
+        backend = BatchBackend(robot_scene.model, 2, num_threads=1)
+        backend.refresh(torch.arange(2))
+        written, write = [], backend._write_history
+        monkeypatch.setattr(
+            backend,
+            "_write_history",
+            lambda worlds, controls: (written.append(worlds.tolist()), write(worlds, controls)),
+        )
+        targets = 0.1 * torch.arange(4.0).view(4, 1).expand(4, 29)
+        for runs in ([[0, 0, 0, 0], [1, 1, 1, 1]], [[0, 0, 0, 2], [1, 3, 3, 3]], [[2, 2, 2, 2], [3, 2, 3, 2]]):
+            backend.step(targets[torch.tensor(runs)])
+        assert written == [[1]]
+
 
 def advance(env: TransformedEnv, tensordict: TensorDictBase, steps: int) -> TensorDictBase:
     torch.manual_seed(0)
