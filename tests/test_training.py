@@ -16,12 +16,13 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
+from torchrl.objectives.value import GAE
 
 from hdmi.cli import run_folder
 from hdmi.learning import CheckpointError, RunningNorm, Trainer, load_checkpoint, load_policy, save_checkpoint
 from hdmi.learning.checkpoint import FORMAT, checkpoints, claim
-from hdmi.learning.networks import observation_norm
-from hdmi.learning.policy import export_policy
+from hdmi.learning.networks import network_of, normalised_networks
+from hdmi.learning.policy import export_policy, make_networks
 from hdmi.learning.trainer import DivergenceError
 
 ROOT = Path(__file__).parents[1]
@@ -107,7 +108,7 @@ class TestRun:
         # shares of the newest: all, all (0.5 * 2 is one), 1 / 1.5, 1 / 2
         expected = ((second + 2 * third) / 3 + fourth) / 2
         torch.testing.assert_close(next(trainer.averaged.module.parameters()), expected)
-        mean, actor = observation_norm(trainer.averaged.module), observation_norm(trainer.actor)
+        mean, actor = network_of(trainer.averaged.module).norm, network_of(trainer.actor).norm
         torch.testing.assert_close(mean.mean, actor.mean, rtol=0, atol=0)
 
     def test_that_mean_is_what_is_evaluated(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -237,10 +238,7 @@ class TestRecovery:
         torch.manual_seed(0)
         with torch.no_grad():
             batch = trainer.env.rollout(4, trainer.actor, break_when_any_done=False)
-            trainer.gae(batch)
-        data = batch.reshape(-1).select(
-            "policy", "critic", "action", "action_log_prob", "advantage", "value_target", "state_value"
-        )
+        data = trainer.prepare(batch)
         data["advantage"].fill_(float("nan"))
         before = [p.clone() for p in trainer.actor.parameters()]
         assert trainer._step(data) is None
@@ -252,6 +250,49 @@ class TestRecovery:
 
         with pytest.raises(DivergenceError, match="without finite loss"):
             step_on()
+
+
+class TestPrepare:
+    """What the learner takes of a batch is what it would get from raw observations."""
+
+    @pytest.fixture(scope="class")
+    def batch(self, fresh: Trainer) -> TensorDictBase:
+        torch.manual_seed(0)
+        with torch.no_grad():
+            batch = fresh.env.rollout(6, fresh.actor, break_when_any_done=False)
+        # the middle of one world's rollout becomes the end of an episode; of another's, one that is only cut off
+        for world, terminated in ((0, True), (1, False)):
+            batch["next", "done"][world, 2] = True
+            batch["next", "terminated"][world, 2] = terminated
+            batch["next", "critic"][world, 2] += 1.0
+        return batch
+
+    def test_values_and_advantages_are_those_of_every_next_state(self, fresh: Trainer, batch: TensorDictBase) -> None:
+        algo = fresh.cfg.algo
+        expected = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=fresh.critic)(batch.clone()).reshape(-1)
+        data = fresh.prepare(batch)
+        for key in ("state_value", "advantage", "value_target"):
+            torch.testing.assert_close(data[key], expected[key], rtol=1e-4, atol=1e-5)
+
+    @pytest.mark.parametrize("bf16", [False, True])
+    def test_networks_answer_alike_and_share_parameters(self, batch: TensorDictBase, bf16: bool) -> None:
+        sizes = {key: batch[key].shape[-1] for key in ("policy", "critic", "action")}
+        cfg = config(f"algo.bf16={bf16}")
+        actor, critic = make_networks(cfg, sizes, torch.device("cpu"))
+        network_of(actor).norm.update(torch.full((sizes["policy"],), 0.3), torch.full((sizes["policy"],), 2.0), n=9)
+        own_actor, own_critic = normalised_networks(actor, critic)
+        data = batch.select("policy", "critic").clone()
+        for key, network in (("policy", actor), ("critic", critic)):
+            data[key] = network_of(network).normalise(data[key])
+            assert data[key].dtype == (torch.bfloat16 if bf16 else torch.float32)
+        actor_out, own_out = actor(batch.select("policy")), own_actor(data)
+        for key in ("loc", "scale"):
+            torch.testing.assert_close(own_out[key], actor_out[key], rtol=0, atol=0)
+        torch.testing.assert_close(
+            own_critic(data)["state_value"], critic(batch.select("critic"))["state_value"], rtol=0, atol=0
+        )
+        assert {id(p) for p in own_actor.parameters()} == {id(p) for p in actor.parameters()}
+        assert {id(p) for p in own_critic.parameters()} == {id(p) for p in critic.parameters()}
 
 
 def test_running_norm_matches_moments_of_all_batches() -> None:

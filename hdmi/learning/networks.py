@@ -61,12 +61,19 @@ class _Network(nn.Module):
             nn.init.orthogonal_(layer.weight, gain if layer is layers[-1] else 2**0.5)
             nn.init.zeros_(layer.bias)
 
-    def evaluate(self, observation: Tensor) -> Tensor:
-        """The MLP's output for raw observations. [..., in_size] -> [..., out_size]"""
+    def normalise(self, observation: Tensor) -> Tensor:
+        """What `respond` takes, in the MLP's precision. [..., in_size]"""
         normalised = self.norm(observation)
-        with torch.autocast(observation.device.type, dtype=torch.bfloat16, enabled=self.bf16):
+        return normalised.bfloat16() if self.bf16 else normalised
+
+    def respond(self, normalised: Tensor) -> Any:
+        """The MLP's output. [..., in_size] -> [..., out_size]"""
+        with torch.autocast(normalised.device.type, dtype=torch.bfloat16, enabled=self.bf16):
             out = self.mlp(normalised)
         return out.float()
+
+    def forward(self, observation: Tensor) -> Any:
+        return self.respond(self.normalise(observation))
 
 
 class _ValueHead(_Network):
@@ -74,9 +81,6 @@ class _ValueHead(_Network):
 
     def __init__(self, in_size: int, **kwargs: Any):
         super().__init__(in_size, 1, gain=1.0, **kwargs)
-
-    def forward(self, observation: Tensor) -> Tensor:
-        return self.evaluate(observation)
 
 
 class _GaussianHead(_Network):
@@ -86,8 +90,8 @@ class _GaussianHead(_Network):
         super().__init__(in_size, out_size, gain=0.01, **kwargs)
         self.log_std = nn.Parameter(torch.full((out_size,), init_noise).log())
 
-    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        loc = self.evaluate(observation)
+    def respond(self, normalised: Tensor) -> tuple[Tensor, Tensor]:
+        loc = super().respond(normalised)
         return loc, self.log_std.exp().clamp(_MIN_STD, _MAX_STD).expand_as(loc)
 
 
@@ -95,7 +99,10 @@ def make_actor(
     in_size: int, out_size: int, hidden: Sequence[int], activation: str, init_noise: float, bf16: bool
 ) -> ProbabilisticActor:
     """Gaussian policy: `policy` [..., in_size] -> `action` [..., out_size] with `loc`, `scale`, `action_log_prob`."""
-    head = _GaussianHead(in_size, out_size, init_noise, hidden=hidden, activation=activation, bf16=bf16)
+    return _actor(_GaussianHead(in_size, out_size, init_noise, hidden=hidden, activation=activation, bf16=bf16))
+
+
+def _actor(head: nn.Module) -> ProbabilisticActor:
     return ProbabilisticActor(
         TensorDictModule(head, in_keys=["policy"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
@@ -106,12 +113,32 @@ def make_actor(
 
 def make_critic(in_size: int, hidden: Sequence[int], activation: str, bf16: bool) -> ValueOperator:
     """State value from privileged observations: `critic` [..., in_size] -> `state_value` [..., 1]."""
-    return ValueOperator(_ValueHead(in_size, hidden=hidden, activation=activation, bf16=bf16), in_keys=["critic"])
+    return _critic(_ValueHead(in_size, hidden=hidden, activation=activation, bf16=bf16))
 
 
-def observation_norm(module: nn.Module) -> RunningNorm:
-    """The normalisation of an actor or critic."""
-    return next(m for m in module.modules() if isinstance(m, RunningNorm))
+def _critic(head: nn.Module) -> ValueOperator:
+    return ValueOperator(head, in_keys=["critic"])
+
+
+class _Respond(nn.Module):
+    """A network that is given what it has normalised before."""
+
+    def __init__(self, network: _Network):
+        super().__init__()
+        self.network = network
+
+    def forward(self, normalised: Tensor) -> Any:
+        return self.network.respond(normalised)
+
+
+def network_of(module: nn.Module) -> _Network:
+    """The network of an actor or critic."""
+    return next(m for m in module.modules() if isinstance(m, _Network))
+
+
+def normalised_networks(actor: nn.Module, critic: nn.Module) -> tuple[ProbabilisticActor, ValueOperator]:
+    """Actor and critic with the same parameters, of observations that their networks' `normalise` has been through."""
+    return _actor(_Respond(network_of(actor))), _critic(_Respond(network_of(critic)))
 
 
 def use_bf16(setting: str | bool, device: torch.device) -> bool:

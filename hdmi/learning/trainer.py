@@ -25,12 +25,12 @@ from hdmi.console import make_console
 from hdmi.learning.checkpoint import CheckpointError, claim, load_checkpoint, rotate, save_checkpoint
 from hdmi.learning.distributed import Ranks
 from hdmi.learning.logger import RunLogger
-from hdmi.learning.networks import observation_norm
+from hdmi.learning.networks import network_of, normalised_networks
 from hdmi.learning.policy import make_networks
 
 _WARMUP_STEPS = 8  # of the untrained policy, for first observation moments
 _MAX_BAD_UPDATES = 20  # minibatches without finite loss or gradient, in a row
-_LEARNER_KEYS = ("policy", "critic", "action", "action_log_prob", "advantage", "value_target", "state_value")
+_COLLECTED_KEYS = ("action", "action_log_prob", ("next", "reward"), ("next", "done"), ("next", "terminated"))
 
 
 class DivergenceError(RuntimeError):
@@ -77,11 +77,13 @@ class Trainer:
             "action": self.env.action_spec.shape[-1],
         }
         self.actor, self.critic = make_networks(cfg, self.sizes, self.device)
+        # moments do not change within an update: the learner normalises observations once for all epochs
+        actor, self.normalised_critic = normalised_networks(self.actor, self.critic)
         algo = cfg.algo
         self.averaged = AveragedModel(self.actor, avg_fn=partial(_recent_mean, share=algo.average))
         self.loss = ClipPPOLoss(
-            self.actor,
-            self.critic,
+            actor,
+            self.normalised_critic,
             clip_epsilon=algo.clip,
             entropy_coeff=algo.entropy,
             critic_coeff=1.0,
@@ -89,7 +91,7 @@ class Trainer:
             normalize_advantage=False,
         )
         self.objective = _Objective(self.loss) if self.ranks.size == 1 else _parallel(_Objective(self.loss))
-        self.gae = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=self.critic, average_gae=False)
+        self.gae = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=None)
         self.actor_optim = torch.optim.Adam(self.actor.parameters(), lr=algo.actor_lr, fused=True)
         self.critic_optim = torch.optim.Adam(self.critic.parameters(), lr=algo.critic_lr, fused=True)
         self.schedule = KLAdaptiveLR(
@@ -113,21 +115,34 @@ class Trainer:
             )
             self._update_moments(batch)
             # The learner once, for nothing: compiled code is guarded by tables of tensordict that its first use fills.
-            self.loss(self.gae(batch).select(*_LEARNER_KEYS).reshape(-1))
+            self.loss(self.prepare(batch))
 
     def _update_moments(self, batch: TensorDictBase) -> None:
         for key, network in (("policy", self.actor), ("critic", self.critic)):
             values = batch[key].reshape(-1, batch[key].shape[-1])
-            observation_norm(network).update(*self.ranks.moments(values), n=len(values) * self.ranks.size)
+            network_of(network).norm.update(*self.ranks.moments(values), n=len(values) * self.ranks.size)
+
+    @torch.no_grad()
+    def prepare(self, batch: TensorDictBase) -> TensorDictBase:
+        """What the loss takes of a batch [N, T]: normalised observations, actions, values, advantages. Batch [N T]"""
+        data = batch.select(*_COLLECTED_KEYS)
+        for key, network in (("policy", self.actor), ("critic", self.critic)):
+            data.set(key, network_of(network).normalise(batch[key]))
+        value = self.normalised_critic(data)["state_value"]  # [N, T, 1]
+        # The next state is the next step's, but where an episode or the batch ends.
+        last = batch["next", "done"].squeeze(-1).clone()
+        last[:, -1] = True
+        following = torch.cat([value[:, 1:], value[:, -1:]], dim=1)
+        following[last] = self.critic(batch["next"].select("critic")[last])["state_value"]
+        data.set(("next", "state_value"), following)
+        return self.gae(data).exclude("next").reshape(-1)
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """One PPO update on a batch [N, T]; returns losses and statistics."""
         algo = self.cfg.algo
         progress = min(self.frames / self.cfg.total_frames, 1.0)
         self.schedule.target_kl = algo.desired_kl + (algo.final_kl - algo.desired_kl) * progress
-        with torch.no_grad():
-            self.gae(batch)
-        data = batch.select(*_LEARNER_KEYS).reshape(-1)
+        data = self.prepare(batch)
         advantage = data["advantage"]
         mean, variance = self.ranks.moments(advantage)
         data["advantage"] = (advantage - mean) / (variance.sqrt() + 1e-6)
