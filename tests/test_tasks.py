@@ -23,7 +23,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, check_env_specs, exploration_type
 
 from hdmi.assets import default_joint_pos, g1
-from hdmi.build import ConfigError, Task, make_env, make_task, make_transforms
+from hdmi.build import ConfigError, Task, make_env, make_task, make_transforms, scene_parts
 from hdmi.evaluation.agents import BlindAgent, task_names
 from hdmi.evaluation.tasks import (
     Training,
@@ -35,7 +35,8 @@ from hdmi.evaluation.tasks import (
     returns,
     sources,
 )
-from hdmi.motion import Motion, forward_kinematics, save_motion
+from hdmi.motion import Motion, find_motion, forward_kinematics, load_motion, save_motion
+from hdmi.motion.validate import validate_motion
 
 ROOT = CONF.parent
 TASKS = task_names()
@@ -78,6 +79,13 @@ def standing_motion(cfg: DictConfig) -> Motion:
         body_quat_w=quat, body_lin_vel_w=zeros, body_ang_vel_w=zeros, joint_pos=joint_pos,
         joint_vel=np.zeros_like(joint_pos), object_contact=contact if contact.size else None,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_reference_that_ships_is_worth_training_on(name: str) -> None:
+    cfg = load_config(f"task={name}")
+    report = validate_motion(load_motion(find_motion(cfg.task.motion)), **scene_parts(cfg))
+    assert report.verdict == "good", report.reasons
 
 
 @pytest.fixture(scope="session")
