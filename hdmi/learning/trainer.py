@@ -360,8 +360,8 @@ class _Objective(torch.nn.Module):
 
 
 def _parallel(objective: _Objective) -> DistributedDataParallel:
-    # running moments are averaged where they are updated
-    return DistributedDataParallel(objective, broadcast_buffers=False)
+    # running moments are averaged where they are updated; gradients need not be copied to be reduced
+    return DistributedDataParallel(objective, broadcast_buffers=False, gradient_as_bucket_view=True)
 
 
 def _recent_mean(mean: Tensor, latest: Tensor, count: Tensor | int, share: float) -> Tensor:
