@@ -209,8 +209,6 @@ def main(cfg: DictConfig) -> None:
             raw_sps.append(raw.replay())
         costs = transform_times(cfg, trainer.task, policy, _STEPS)
 
-        # workers that collect during updates would go on collecting beside physics, and its time is not counted
-        in_turns = not getattr(trainer.collector, "overlap", False)
         collect, learn, train, raw_beside = [], [], [], []
         for i in range(_ITERATIONS + 1):
             start = now()
@@ -223,7 +221,7 @@ def main(cfg: DictConfig) -> None:
                 collect.append(frames / (middle - start))
                 learn.append(frames / (end - middle))
                 train.append(frames / (end - start))
-                if in_turns:
+                if not trainer.collector.overlap:  # its workers would collect on, in time that is not counted
                     raw_beside.append(raw.replay())
         trainer.collector.shutdown()
         raw_beside = raw_beside or [raw.replay() for _ in train]

@@ -274,6 +274,16 @@ class TestPrepare:
         for key in ("state_value", "advantage", "value_target"):
             torch.testing.assert_close(data[key], expected[key], rtol=1e-4, atol=1e-5)
 
+    def test_loss_begins_at_the_policy_that_acted_and_the_values_it_was_given(
+        self, fresh: Trainer, batch: TensorDictBase
+    ) -> None:
+        data = fresh.prepare(batch)
+        losses = fresh.loss(data)
+        critic = torch.nn.functional.smooth_l1_loss(data["state_value"], data["value_target"])
+        torch.testing.assert_close(losses["loss_critic"], critic)
+        torch.testing.assert_close(losses["kl_approx"], torch.tensor(0.0), rtol=0, atol=1e-4)
+        torch.testing.assert_close(losses["clip_fraction"], torch.tensor(0.0))
+
     @pytest.mark.parametrize("bf16", [False, True])
     def test_networks_answer_alike_and_share_parameters(self, batch: TensorDictBase, bf16: bool) -> None:
         sizes = {key: batch[key].shape[-1] for key in ("policy", "critic", "action")}

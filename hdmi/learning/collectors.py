@@ -71,6 +71,8 @@ class InlineCollector:
         cfg, task: what to simulate; `cfg.num_envs` worlds.
     """
 
+    overlap = False  # nothing is collected while the learner updates
+
     def __init__(self, cfg: DictConfig, task: Task):
         self.cfg = cfg
         self.env = make_env(cfg, task=task)

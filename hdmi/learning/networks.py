@@ -62,18 +62,18 @@ class _Network(nn.Module):
             nn.init.zeros_(layer.bias)
 
     def normalise(self, observation: Tensor) -> Tensor:
-        """What `respond` takes, in the MLP's precision. [..., in_size]"""
+        """Normalised observations as `forward_normalised` takes them, in the MLP's precision. [..., in_size]"""
         normalised = self.norm(observation)
         return normalised.bfloat16() if self.bf16 else normalised
 
-    def respond(self, normalised: Tensor) -> Any:
+    def forward_normalised(self, normalised: Tensor) -> Any:
         """The MLP's output. [..., in_size] -> [..., out_size]"""
         with torch.autocast(normalised.device.type, dtype=torch.bfloat16, enabled=self.bf16):
             out = self.mlp(normalised)
         return out.float()
 
     def forward(self, observation: Tensor) -> Any:
-        return self.respond(self.normalise(observation))
+        return self.forward_normalised(self.normalise(observation))
 
 
 class _ValueHead(_Network):
@@ -90,8 +90,8 @@ class _GaussianHead(_Network):
         super().__init__(in_size, out_size, gain=0.01, **kwargs)
         self.log_std = nn.Parameter(torch.full((out_size,), init_noise).log())
 
-    def respond(self, normalised: Tensor) -> tuple[Tensor, Tensor]:
-        loc = super().respond(normalised)
+    def forward_normalised(self, normalised: Tensor) -> tuple[Tensor, Tensor]:
+        loc = super().forward_normalised(normalised)
         return loc, self.log_std.exp().clamp(_MIN_STD, _MAX_STD).expand_as(loc)
 
 
@@ -120,15 +120,15 @@ def _critic(head: nn.Module) -> ValueOperator:
     return ValueOperator(head, in_keys=["critic"])
 
 
-class _Respond(nn.Module):
-    """A network that is given what it has normalised before."""
+class _AfterNorm(nn.Module):
+    """A network behind its normalisation, with the same parameters."""
 
     def __init__(self, network: _Network):
         super().__init__()
         self.network = network
 
     def forward(self, normalised: Tensor) -> Any:
-        return self.network.respond(normalised)
+        return self.network.forward_normalised(normalised)
 
 
 def network_of(module: nn.Module) -> _Network:
@@ -137,8 +137,12 @@ def network_of(module: nn.Module) -> _Network:
 
 
 def normalised_networks(actor: nn.Module, critic: nn.Module) -> tuple[ProbabilisticActor, ValueOperator]:
-    """Actor and critic with the same parameters, of observations that their networks' `normalise` has been through."""
-    return _actor(_Respond(network_of(actor))), _critic(_Respond(network_of(critic)))
+    """The same actor and critic, sharing parameters, for observations that are normalised already.
+
+    Their `policy` [..., in_size] and `critic` [..., in_size] are what `network_of(...).normalise` returns; what they
+    write is what `make_actor` and `make_critic` say.
+    """
+    return _actor(_AfterNorm(network_of(actor))), _critic(_AfterNorm(network_of(critic)))
 
 
 def use_bf16(setting: str | bool, device: torch.device) -> bool:

@@ -124,7 +124,16 @@ class Trainer:
 
     @torch.no_grad()
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
-        """What the loss takes of a batch [N, T]: normalised observations, actions, values, advantages. Batch [N T]"""
+        """What the loss takes of a batch, computed once for all epochs.
+
+        Args:
+            batch: collected steps, [N, T], the steps of a world in order. Reads `policy`, `critic`, `action`,
+                `action_log_prob`, and of `next` `critic`, `reward`, `done`, `terminated`.
+
+        Returns:
+            Batch [N T]: `policy` and `critic` normalised, `action`, `action_log_prob`, and by GAE `state_value`,
+            `advantage`, `value_target` [N T, 1].
+        """
         data = batch.select(*_COLLECTED_KEYS)
         for key, network in (("policy", self.actor), ("critic", self.critic)):
             data.set(key, network_of(network).normalise(batch[key]))
@@ -132,7 +141,7 @@ class Trainer:
         # The next state is the next step's, but where an episode or the batch ends.
         last = batch["next", "done"].squeeze(-1).clone()
         last[:, -1] = True
-        following = torch.cat([value[:, 1:], value[:, -1:]], dim=1)
+        following = value.roll(-1, dims=1)
         following[last] = self.critic(batch["next"].select("critic")[last])["state_value"]
         data.set(("next", "state_value"), following)
         return self.gae(data).exclude("next").reshape(-1)
