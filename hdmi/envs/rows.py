@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
-_ENVS_PER_THREAD = 1024
+_ENVS_PER_THREAD = 4096  # with 2048, a second thread saves 0.4 ms of a step and costs physics 8
 
 
 @contextmanager
@@ -35,7 +35,7 @@ class RowResetEnv(TransformedEnv):
     then costs twice. Here base environment and transforms are given the n rows, with their numbers
     under `worlds` int64 [n], and results are written into copies of the others' tensors. `reset` itself is unchanged.
 
-    While it steps, torch has one thread per 1024 environments; see `torch_threads`.
+    While it steps, torch has one thread per 4096 environments; see `torch_threads`.
 
     `compile_transforms` compiles the stack with `torch.compile`.
 
@@ -83,9 +83,9 @@ class RowResetEnv(TransformedEnv):
         if not self.any_done(tensordict):
             return tensordict
         worlds = tensordict.get("_reset").reshape(-1).nonzero().squeeze(-1)
-        part = tensordict[worlds].set("worlds", worlds)
-        tensordict = tensordict.exclude("_reset")
-        with torch_threads(len(worlds)):
+        with torch_threads(len(worlds)):  # taking rows out of large tensors would wake the others already
+            part = tensordict[worlds].set("worlds", worlds)
+            tensordict = tensordict.exclude("_reset")
             part = self.transform._reset_env_preprocess(part)
             # a kernel for n rows would be compiled anew for one
             reset = self._reset_transforms if len(worlds) > 1 else self.transform._reset
