@@ -297,9 +297,19 @@ class TestCheck:
         assert 0 < check.zero["survival"]["mean"] <= 1
 
     def test_gain_is_that_of_the_same_episodes(self):
-        gain, error = Training(before=np.array([1.0, 5.0, 9.0]), after=np.array([2.0, 7.0, 12.0])).gain
-        assert gain == pytest.approx(2.0)
-        assert error == pytest.approx(1 / 3**0.5)
+        training = Training(before=np.array([1.0, 5.0, 9.0, 4.0]), after=np.array([2.0, 8.0, 14.0, 2.0]))
+        assert training.gain == pytest.approx((1.75, 2.0))
+        # of the 16 ways to sign ranks 1 to 4, those of the positive ones sum up to 8 or more in three
+        assert training.chance == pytest.approx(3 / 16)
+
+    def test_one_lost_episode_does_not_outweigh_all_others(self):
+        before, after = np.zeros(20), np.arange(1.0, 21.0)
+        after[-1] = -200.0
+        training = Training(before, after)
+        assert training.gain == pytest.approx((-0.5, 9.5))
+        assert training.chance < 0.01
+        assert Training(after, before).chance > 0.99
+        assert Training(before, before).chance == pytest.approx(0.5, abs=0.1)
 
     def test_the_same_policy_earns_the_same(self):
         # starts and randomization are drawn alike, so that only the policy makes a difference

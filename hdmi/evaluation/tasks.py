@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 from rich.table import Table
+from scipy.stats import wilcoxon
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
 from hdmi.build import ConfigError, Task, make_env, make_task, scene_parts, set_threads
@@ -28,7 +29,8 @@ from hdmi.motion import MotionError, find_motion, load_motion, make_playback
 from hdmi.motion.annotate import intervals
 
 _SPEC_ENVS, _EPISODES = 2, 16
-_RETURN_ENVS, _RETURN_STEPS = 512, 96  # episodes before and after a training, and control steps of each
+_RETURN_ENVS, _RETURN_STEPS = 384, 96  # episodes before and after a training, and control steps of each
+_CHANCE = 0.01  # at most, that a training without effect passes
 _DISTANCE = 3.2  # of the camera, m
 
 
@@ -148,9 +150,17 @@ class Training:
 
     @property
     def gain(self) -> tuple[float, float]:
-        """Mean difference of the returns, and its standard error."""
+        """Mean and median difference of the returns."""
         difference = self.after - self.before
-        return float(difference.mean()), float(difference.std(ddof=1) / math.sqrt(len(difference)))
+        return float(difference.mean()), float(np.median(difference))
+
+    @property
+    def chance(self) -> float:
+        """Probability of differences as good as these if training changed nothing (Wilcoxon's signed-rank test).
+
+        Ranks, because returns have long tails: an episode that starts with a shin in a door may return -179.
+        """
+        return float(wilcoxon(self.after - self.before, zero_method="zsplit", alternative="greater").pvalue)
 
 
 @dataclass
@@ -176,7 +186,7 @@ def check_task(
     3. Servos that follow the reference give finite survival and errors.
     4. A training of `frames` control steps improves the return that PPO maximizes, that of the policy with its
        exploration noise: both policies play the first steps of the same episodes (start frames, perturbations and
-       randomization drawn alike), and the mean difference is at least twice its standard error. 0 skips it.
+       randomization drawn alike), and a signed-rank test finds the trained one better. 0 skips it.
 
     Raises:
         ConfigError, MotionError: if the task or its motion does not exist or cannot be used.
@@ -210,9 +220,12 @@ def check_task(
         check.problems.append(f"no policy: {bad or 'no figures'} not finite")
     if frames:
         check.training = _train(cfg, task)
-        gain, deviation = check.training.gain
-        if not gain > 2 * deviation:
-            check.problems.append(f"training: the return changed by {gain:+.3f}, standard error {deviation:.3f}")
+        if not check.training.chance < _CHANCE:
+            mean, middle = check.training.gain
+            check.problems.append(
+                f"training: the return changed by {mean:+.3f} on average, {middle:+.3f} in the median; that this is no "
+                f"chance takes a probability below {_CHANCE:g}, and it is {check.training.chance:.2g}"
+            )
     check.seconds = time.perf_counter() - start
     return check
 
@@ -256,7 +269,10 @@ def check_table(checks: Sequence[TaskCheck]) -> Table:
 
         object_error = shown("object_joint_error", " rad") or shown("object_pos_error", " m")
         learned = check.training
-        gain = "" if learned is None else "{:+.2f} ±{:.2f} of {:.2f}".format(*learned.gain, learned.before.mean())
+        gain = ""
+        if learned is not None:
+            mean, middle = learned.gain
+            gain = f"{mean:+.2f} of {learned.before.mean():.2f}, median {middle:+.2f}, p {learned.chance:.0e}"
         table.add_row(
             check.name, distance, gap, shown("survival"), shown("joint_error"), shown("body_error"), object_error,
             gain, f"{check.seconds:.0f}", "\n".join(check.problems) or "none",
