@@ -35,6 +35,20 @@ def test_benchmark_ends_with_its_figures_as_json(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "grid.jsonl").read_text()) == figures
 
 
+def test_benchmark_of_workers_that_collect_during_updates(tmp_path: Path) -> None:
+    options = ["num_envs=4", "algo.frames_per_env=4", "num_threads=1", "logger=csv", "compare.steps=0"]
+    workers = ["collector=process", "collector.num_workers=2", "collector.threads_per_worker=1"]
+    command = [sys.executable, str(ROOT / "scripts" / "benchmark.py"), *options, *workers]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=200)
+    assert result.returncode == 0, result.stderr
+    figures = json.loads(result.stdout.strip().splitlines()[-1])
+    assert figures["num_envs"] == 4  # not the two of a worker
+    assert 0 < figures["env_ratio"] < 1
+    assert figures["train_ratio"] > 0
+    assert "mujoco_env_sps" not in figures
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_sweep_runs_as_jobs(tmp_path: Path) -> None:
     pytest.importorskip("submitit")
