@@ -31,7 +31,7 @@ TINY = [
     "algo.actor_hidden=[32]", "algo.critic_hidden=[32]", "algo.bf16=false", "checkpoint_interval=2",
     "logger=csv", "video=false", "num_threads=1", "eval_envs=2",
     "algo.average=0.5",  # of four iterations: the mean is none of them
-    "algo.final_kl=0.015",  # as at the beginning: budgets are extended below, and the fall depends on the budget
+    "algo.final_kl=${algo.desired_kl}",  # no fall: it depends on the budget, and budgets are extended below
 ]  # fmt: skip
 
 
