@@ -311,6 +311,14 @@ class TestCheck:
         assert Training(after, before).chance > 0.99
         assert Training(before, before).chance == pytest.approx(0.5, abs=0.1)
 
+    def test_a_training_that_makes_it_worse_fails(self):
+        worse, better = np.arange(20.0), np.arange(1.0, 21.0)
+        for training, problems in ((Training(worse, better), 0), (Training(better, worse), 1)):
+            with patch("hdmi.evaluation.tasks._train", return_value=training):
+                found = check_task("lift_box", frames=1).problems
+            assert len(found) == problems
+            assert all("in the median by -1.000" in problem for problem in found)
+
     def test_the_same_policy_earns_the_same(self):
         # starts and randomization are drawn alike, so that only the policy makes a difference
         cfg = load_config()

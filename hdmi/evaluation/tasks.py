@@ -30,7 +30,7 @@ from hdmi.motion.annotate import intervals
 
 _SPEC_ENVS, _EPISODES = 2, 16
 _RETURN_ENVS, _RETURN_STEPS = 384, 96  # episodes before and after a training, and control steps of each
-_CHANCE = 0.01  # at most, that a training without effect passes
+_CHANCE = 0.01  # p-value below which a training counts as an improvement
 _DISTANCE = 3.2  # of the camera, m
 
 
@@ -156,7 +156,7 @@ class Training:
 
     @property
     def chance(self) -> float:
-        """Probability of differences as good as these if training changed nothing (Wilcoxon's signed-rank test).
+        """One-sided p-value of Wilcoxon's signed-rank test that the trained policy is no better.
 
         Ranks, because returns have long tails: an episode that starts with a shin in a door may return -179.
         """
@@ -220,11 +220,12 @@ def check_task(
         check.problems.append(f"no policy: {bad or 'no figures'} not finite")
     if frames:
         check.training = _train(cfg, task)
-        if not check.training.chance < _CHANCE:
+        chance = check.training.chance
+        if not chance < _CHANCE:
             mean, middle = check.training.gain
             check.problems.append(
-                f"training: the return changed by {mean:+.3f} on average, {middle:+.3f} in the median; that this is no "
-                f"chance takes a probability below {_CHANCE:g}, and it is {check.training.chance:.2g}"
+                f"training: the return changed by {mean:+.3f}, in the median by {middle:+.3f}; "
+                f"signed-rank test: p = {chance:.2g}, expected less than {_CHANCE:g}"
             )
     check.seconds = time.perf_counter() - start
     return check
