@@ -178,6 +178,7 @@ def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
     context = {
         "reference": task.reference,
         "model": task.scene.model,
+        "robot_bodies": task.scene.body_ids.tolist(),
         "effectors": task.scene.effectors,
         "object_geoms": task.scene.object_geoms,
         "control_dt": task.scene.sim.control_dt,

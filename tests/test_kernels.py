@@ -135,27 +135,35 @@ def test_error_exceeds_if_any_is_above():
 
 
 @pytest.mark.parametrize(
-    ("offset", "newton", "active", "lost"),
+    ("offset", "newton", "require", "active", "lost"),
     [
-        (0.5, 0.0, True, True),
-        (0.1, 0.0, True, False),  # near
-        (0.5, 50.0, True, False),  # held
-        (0.1, 50.0, True, False),
-        (0.5, 0.0, False, False),  # not intended
+        (0.5, 0.0, "either", True, True),  # far and loose
+        (0.5, 0.0, "both", True, True),
+        (0.1, 0.0, "either", True, True),  # near, but loose
+        (0.1, 0.0, "both", True, False),
+        (0.5, 50.0, "either", True, True),  # firm, but far
+        (0.5, 50.0, "both", True, False),
+        (0.1, 50.0, "either", True, False),  # held
+        (0.1, 50.0, "both", True, False),
+        (0.5, 0.0, "either", False, False),  # not intended
+        (0.5, 0.0, "both", False, False),
     ],
 )
-def test_contact_is_lost_when_far_and_loose(offset, newton, active, lost):
+def test_contact_is_lost(offset, newton, require, active, lost):
     pos = torch.tensor([[0.0, 0.0, offset], [0.0, 0.0, 0.0]])
-    force = torch.tensor([[newton, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    result = contact_lost(pos, torch.zeros(2, 3), force, torch.tensor([active, True]), distance=0.2, min_force=1.0)
+    force = torch.tensor([[newton, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    flags = torch.tensor([active, True])
+    result = contact_lost(pos, torch.zeros(2, 3), force, flags, distance=0.2, min_force=1.0, require=require)
     assert result.tolist() == [lost]
 
 
-def test_far_and_loose_must_be_the_same_effector():
+def test_where_both_are_required_they_must_be_of_the_same_effector():
     pos = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])  # the left is far but presses, the right near and loose
     force = torch.tensor([[50.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     active = torch.tensor([True, True])
-    assert not contact_lost(pos, torch.zeros(2, 3), force, active, distance=0.2, min_force=1.0).item()
+    given = {"distance": 0.2, "min_force": 1.0}
+    assert not contact_lost(pos, torch.zeros(2, 3), force, active, **given, require="both").item()
+    assert contact_lost(pos, torch.zeros(2, 3), force, active, **given, require="either").item()
 
 
 def test_persist_counts_and_starts_over():

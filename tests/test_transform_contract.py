@@ -72,6 +72,11 @@ CASES: dict[str, Case] = {
     ),
     "Angle": Case(lambda: T.Angle(ROBOT_BODY[1], ROBOT_BODY[1], "out"), "function", (ROBOT_BODY[1],)),
     "BodyHeight": Case(lambda: T.BodyHeight(threshold=0.5, min_steps=2), "state", (ROBOT_BODY[0],), ends=True),
+    "BodyHeightError": Case(
+        lambda: T.BodyHeightError("a", ["a", "b"], ROBOT_BODY[0], ROBOT_BODY[0], "out", ("a", "b", "c")),
+        "function",
+        (ROBOT_BODY[0],),
+    ),
     "CenterOfMassRandomization": Case(
         lazy("CenterOfMassRandomization", bodies=["pelvis"], shift=0.1), "init", random=True
     ),

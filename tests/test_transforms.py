@@ -736,7 +736,10 @@ class TestTermination:
         assert step["termination", "a"].flatten().tolist() == [False, True]
         assert step["termination", "b"].flatten().tolist() == [True, False]
 
-    def test_lost_contact(self):
+    @pytest.mark.parametrize(
+        ("require", "lost"), [("either", [True, True, True, False]), ("both", [True, False, False, False])]
+    )
+    def test_lost_contact(self, require, lost):
         """Rows: far and loose; far, but pressing; loose, but near; far and loose, but not intended."""
         far, near = [1.0, 0, 0], [0.1, 0, 0]
         script = {
@@ -745,8 +748,8 @@ class TestTermination:
             ("contact", "force"): torch.tensor([0.0, 2.0, 0.0, 0.0])[None, :, None, None] * torch.ones(1, 1, 1, 3),
             ("ref", "contact"): torch.tensor([True, True, True, False])[None, :, None],
         }
-        env = wrap(ScriptedEnv(script), T.LostContact(distance=0.2, min_force=1.0, min_steps=1))
-        assert drive(env, 1)[0]["next", "terminated"].flatten().tolist() == [True, False, False, False]
+        env = wrap(ScriptedEnv(script), T.LostContact(distance=0.2, min_force=1.0, min_steps=1, require=require))
+        assert drive(env, 1)[0]["next", "terminated"].flatten().tolist() == lost
 
     def test_body_height(self):
         heights = torch.tensor([0.31, 0.29])
@@ -758,7 +761,31 @@ class TestTermination:
         )
         assert drive(env, 1)[0]["next", "terminated"].flatten().tolist() == [False, True]
 
+    def test_body_height_error_is_against_the_reference(self):
+        """A torso beside a stool of 0.32 m, and one that crouches where the reference does."""
+        pos, ref = torch.zeros(1, 2, 2, 3), torch.zeros(1, 2, 2, 3)
+        pos[0, :, 1, 2], ref[0, :, 1, 2] = torch.tensor([0.8, 0.25]), torch.tensor([1.12, 0.25])
+        env = wrap(
+            ScriptedEnv({("tracked", "body_pos"): pos, ("ref", "body_pos"): ref}),
+            T.BodyHeightError("torso", ["b", "torso"], body_names=("a", "torso", "b")),
+            T.ErrorTermination("torso_height", [("error", "torso_height")], [0.3], min_steps=1),
+        )
+        step = drive(env, 1)[0]["next"]
+        # of the tracked bodies `torso` is the first
+        assert step["error", "torso_height"].flatten().tolist() == [0.0, 0.0]
+        pos, ref = pos.flip(2), ref.flip(2)
+        env = wrap(
+            ScriptedEnv({("tracked", "body_pos"): pos, ("ref", "body_pos"): ref}),
+            T.BodyHeightError("torso", ["b", "torso"], body_names=("a", "torso", "b")),
+            T.ErrorTermination("torso_height", [("error", "torso_height")], [0.3], min_steps=1),
+        )
+        step = drive(env, 1)[0]["next"]
+        torch.testing.assert_close(step["error", "torso_height"].flatten(), torch.tensor([0.32, 0.0]))
+        assert step["terminated"].flatten().tolist() == [True, False]
+
     def test_refusals(self):
+        with pytest.raises(ValueError, match="require"):
+            T.LostContact(require="any")
         with pytest.raises(ValueError, match="min_steps"):
             T.ErrorTermination("t", ["a"], [1.0], min_steps=0)
         with pytest.raises(ValueError, match="one threshold"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -76,6 +76,8 @@ class ObjectConfig:
         geoms: in the frame of that body (`GeomConfig` or the same as a mapping).
         mass: kg, spread over the geoms (of the link, if articulated and fixed) by volume.
         friction: sliding friction.
+        friction_combine: of a pair that the object is one of: `max`, MuJoCo's rule, takes the larger friction; `object`
+            takes the object's (MuJoCo's `priority`), however rough the hand.
         torsional_friction: m, about the radius of the patch in which hands touch it: contacts then resist turning about
             their normal, too (condim 4); 0: they do not.
         hinge: the link of an articulated object.
@@ -87,6 +89,7 @@ class ObjectConfig:
     geoms: Sequence[Any] = ()
     mass: float = 1.0
     friction: float = 0.6
+    friction_combine: Literal["max", "object"] = "max"
     torsional_friction: float = 0.0
     hinge: Any = None
     fixed_base: bool = False
@@ -97,6 +100,10 @@ class ObjectConfig:
             raise ValueError(f"object {self.name!r}: has no geoms")
         if not (self.mass > 0 and np.isfinite(self.mass)):
             raise ValueError(f"object {self.name!r}: mass must be positive, got {self.mass}")
+        if self.friction_combine not in ("max", "object"):
+            raise ValueError(
+                f"object {self.name!r}: friction_combine is 'max' or 'object', got {self.friction_combine!r}"
+            )
         if self.hinge is not None and not isinstance(self.hinge, HingeConfig):
             object.__setattr__(self, "hinge", HingeConfig(**self.hinge))
 
@@ -173,6 +180,7 @@ def add_geoms(
     friction: float,
     rgba: Sequence[float],
     torsional_friction: float = 0.0,
+    priority: int = 0,
 ) -> None:
     """Adds collision geoms that are also the visuals to `body`; `mass` is spread over them by volume.
 
@@ -193,6 +201,7 @@ def add_geoms(
             "quat": _multiply(config.body_quat, config.quat),
             "friction": [friction, torsional_friction or 0.005, 0.0001],
             "condim": 4 if torsional_friction else 3,
+            "priority": priority,
             "rgba": config.rgba or rgba,
         }
         if config.mesh is not None:
@@ -237,6 +246,7 @@ def add_object(spec: mujoco.MjSpec, config: ObjectConfig, pos: Sequence[float], 
     surface: dict[str, Any] = {
         "friction": config.friction,
         "torsional_friction": config.torsional_friction,
+        "priority": int(config.friction_combine == "object"),
         "rgba": config.rgba,
     }
     add_geoms(spec, body, config.geoms, mass=base_mass, **surface)

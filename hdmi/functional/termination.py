@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from torch import Tensor
 
 
@@ -11,22 +13,31 @@ def error_exceeds(error: Tensor, threshold: float) -> Tensor:
 
 
 def contact_lost(
-    eef_pos_w: Tensor, target_pos_w: Tensor, force: Tensor, active: Tensor, *, distance: float, min_force: float
+    eef_pos_w: Tensor,
+    target_pos_w: Tensor,
+    force: Tensor,
+    active: Tensor,
+    *,
+    distance: float,
+    min_force: float,
+    require: Literal["either", "both"] = "either",
 ) -> Tensor:
-    """Whether an end effector that should touch is both too far from its contact point and without force.
+    """Whether an end effector that should touch is too far from its contact point, or touches without force.
 
     Args:
         eef_pos_w, target_pos_w: m. [..., E, 3]
         force: N. [..., E, 3]
         active: whether contact is intended. bool [..., E]
         distance: m. min_force: N.
+        require: `either`: a contact is near and firm, and lost when it is far or loose; `both`: only when it is both.
 
     Returns:
         bool [..., 1]
     """
     far = (eef_pos_w - target_pos_w).norm(dim=-1) > distance
     loose = force.norm(dim=-1) < min_force
-    return (far & loose & active).any(-1, keepdim=True)
+    lost = far | loose if require == "either" else far & loose
+    return (lost & active).any(-1, keepdim=True)
 
 
 def persist(condition: Tensor, count: Tensor) -> Tensor:

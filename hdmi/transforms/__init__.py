@@ -55,6 +55,7 @@ from hdmi.transforms.termination import BodyHeight, ErrorTermination, LostContac
 from hdmi.transforms.tracking import (
     AbsoluteDifference,
     Angle,
+    BodyHeightError,
     ContactMade,
     ContactPoints,
     Distance,
@@ -73,6 +74,7 @@ __all__ = [
     "AdaptiveStateInitialization",
     "Angle",
     "BodyHeight",
+    "BodyHeightError",
     "CenterOfMassRandomization",
     "ContactMade",
     "ContactPoints",

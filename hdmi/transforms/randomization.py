@@ -102,11 +102,26 @@ class ModelRandomization(SpecTransform):
         return rows
 
 
+def _find_bodies(
+    model: mujoco.MjModel,
+    patterns: Sequence[str],
+    among: Literal["scene", "robot"],
+    robot_bodies: Sequence[int],
+    where: str,
+) -> list[int]:
+    """Ids of the bodies that match: of all, or of the robot's alone, whatever an object's are called."""
+    if among not in ("scene", "robot"):
+        raise ValueError(f"{where}.among: 'scene' or 'robot', got {among!r}")
+    ids = list(range(model.nbody)) if among == "scene" else [int(i) for i in robot_bodies]
+    return [ids[i] for i in match_names(patterns, [model.body(i).name for i in ids], f"{where}.bodies")]
+
+
 class MassRandomization(ModelRandomization):
     """Scales mass and inertia of bodies, each on its own, or sets the total mass of an object.
 
     Args:
-        bodies: name patterns among the model's bodies.
+        bodies: name patterns. among: which bodies they are matched with, all of the `scene` or the `robot`'s.
+        robot_bodies: ids of the robot's.
         scale: range of the factor; or
         mass: range of the bodies' total mass, kg, shared in proportion.
     """
@@ -118,12 +133,13 @@ class MassRandomization(ModelRandomization):
         scale: Sequence[float] | None = None,
         mass: Sequence[float] | None = None,
         per: Literal["episode", "world"] = "episode",
+        among: Literal["scene", "robot"] = "scene",
+        robot_bodies: Sequence[int] = (),
     ):
         super().__init__(per, model, ("body_mass", "body_inertia"))
         if (scale is None) == (mass is None):
             raise ValueError("MassRandomization: give either scale or mass")
-        names = [model.body(i).name for i in range(model.nbody)]
-        index = match_names(bodies, names, "MassRandomization.bodies")
+        index = _find_bodies(model, bodies, among, robot_bodies, "MassRandomization")
         self.register_buffer("bodies", torch.as_tensor(index), persistent=False)
         self.scale, self.mass = scale, mass
         self.total = float(model.body_mass[index].sum())
@@ -144,7 +160,7 @@ class MassRandomization(ModelRandomization):
 
 
 class CenterOfMassRandomization(ModelRandomization):
-    """Shifts the centre of mass of bodies by up to `shift` m along each axis."""
+    """Shifts the centre of mass of bodies by up to `shift` m along each axis; for `bodies`, see `MassRandomization`."""
 
     def __init__(
         self,
@@ -152,10 +168,11 @@ class CenterOfMassRandomization(ModelRandomization):
         bodies: Sequence[str],
         shift: float,
         per: Literal["episode", "world"] = "episode",
+        among: Literal["scene", "robot"] = "scene",
+        robot_bodies: Sequence[int] = (),
     ):
         super().__init__(per, model, ("body_ipos",))
-        names = [model.body(i).name for i in range(model.nbody)]
-        index = match_names(bodies, names, "CenterOfMassRandomization.bodies")
+        index = _find_bodies(model, bodies, among, robot_bodies, "CenterOfMassRandomization")
         self.register_buffer("bodies", torch.as_tensor(index), persistent=False)
         self.shift = shift
 
@@ -167,9 +184,10 @@ class CenterOfMassRandomization(ModelRandomization):
 
 
 class FrictionRandomization(ModelRandomization):
-    """Draws one sliding friction for all geoms of the named bodies.
+    """Draws one sliding friction for all geoms of the named bodies; for `bodies`, see `MassRandomization`.
 
-    MuJoCo uses the larger friction of two geoms in contact; floor and scenery have next to none of their own.
+    MuJoCo uses the larger friction of two geoms in contact, or that of an object which says so; floor and scenery have
+    next to none of their own.
     """
 
     def __init__(
@@ -178,10 +196,11 @@ class FrictionRandomization(ModelRandomization):
         bodies: Sequence[str],
         friction: Sequence[float],
         per: Literal["episode", "world"] = "episode",
+        among: Literal["scene", "robot"] = "scene",
+        robot_bodies: Sequence[int] = (),
     ):
         super().__init__(per, model, ("geom_friction",))
-        names = [model.body(i).name for i in range(model.nbody)]
-        wanted = match_names(bodies, names, "FrictionRandomization.bodies")
+        wanted = _find_bodies(model, bodies, among, robot_bodies, "FrictionRandomization")
         geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in wanted]
         self.register_buffer("geoms", torch.as_tensor(geoms), persistent=False)
         self.friction = friction

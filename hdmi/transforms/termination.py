@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -77,7 +78,17 @@ class ErrorTermination(TerminationTerm):
 
 
 class LostContact(TerminationTerm):
-    """An intended contact is lost: too far from its contact point and without force; see `functional.contact_lost`."""
+    """An intended contact is lost: too far from its contact point, or without force; see `functional.contact_lost`.
+
+    Reads `contact/{eef_pos, target_pos, force}` [N, E, 3] (m, m, N) and `ref/contact` bool [N, E].
+
+    Args:
+        distance: m. min_force: N.
+        require: for a loss, `either` of the two, or `both`.
+
+    Raises:
+        ValueError: for another `require`.
+    """
 
     def __init__(
         self,
@@ -85,20 +96,24 @@ class LostContact(TerminationTerm):
         distance: float = 0.2,
         min_force: float = 1.0,
         min_steps: int = 25,
+        require: Literal["either", "both"] = "either",
         eef_pos_key: NestedKey = ("contact", "eef_pos"),
         target_pos_key: NestedKey = ("contact", "target_pos"),
         force_key: NestedKey = ("contact", "force"),
         active_key: NestedKey = ("ref", "contact"),
     ):
         super().__init__(name, [eef_pos_key, target_pos_key, force_key, active_key], min_steps)
+        if require not in ("either", "both"):
+            raise ValueError(f"termination {name!r}: require is 'either' or 'both', got {require!r}")
         self.distance, self.min_force = distance, min_force
+        self.require: Literal["either", "both"] = require
 
     def condition(self, *inputs: Tensor) -> Tensor:
-        return F.contact_lost(*inputs, distance=self.distance, min_force=self.min_force)
+        return F.contact_lost(*inputs, distance=self.distance, min_force=self.min_force, require=self.require)
 
 
 class BodyHeight(TerminationTerm):
-    """A body (the torso) is lower than a threshold, m."""
+    """A body (the torso) is lower over the floor than a threshold, m, whatever the reference does."""
 
     def __init__(
         self,

@@ -71,6 +71,34 @@ class AbsoluteDifference(FunctionTransform):
         return difference if self.index is None else difference[..., self.index]
 
 
+class BodyHeightError(FunctionTransform):
+    """How far the height of one of the tracked bodies is from the reference's, m. [N, K, 3], [N, K, 3] -> [N, 1]
+
+    Args:
+        body: name of the body.
+        tracked_bodies: name patterns of the K bodies, among `body_names`.
+
+    Raises:
+        ValueError: if `body` is none of the tracked ones.
+    """
+
+    def __init__(
+        self,
+        body: str,
+        tracked_bodies: Sequence[str],
+        a_key: NestedKey = ("tracked", "body_pos"),
+        b_key: NestedKey = ("ref", "body_pos"),
+        out_key: NestedKey = ("error", "torso_height"),
+        body_names: Sequence[str] = g1.BODY_NAMES,
+    ):
+        super().__init__([a_key, b_key], [out_key])
+        tracked = [body_names[i] for i in match_names(tracked_bodies, body_names, "tracked_bodies")]
+        self.body = match_names([body], tracked, "body")[0]
+
+    def function(self, *inputs: Tensor) -> Tensor:
+        return (inputs[0] - inputs[1])[..., self.body, 2:].abs()
+
+
 class JointErrors(AbsoluteDifference):
     """Absolute error of the tracked joints. [..., 29], [..., 29] -> [..., J']
 
