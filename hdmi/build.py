@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 from torchrl.envs import CatTensors, Compose, RemoveEmptySpecs, SelectTransform, Transform
 
-from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene
+from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene, g1, match_names
 from hdmi.envs import HumanoidObjectEnv, MaskedResetEnv, PhysicsBackend, RowResetEnv
 from hdmi.motion import Reference, find_motion, make_reference
 
@@ -95,7 +95,10 @@ def _dataclass(cls: type, node: Any, where: str) -> Any:
     names = {f.name for f in fields(cls)}
     if unknown := set(values) - names:
         raise ConfigError(f"{where}: unknown {sorted(map(str, unknown))}; there is {sorted(names)}")
-    return cls(**values)
+    try:
+        return cls(**values)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{where}: {error}") from error
 
 
 def scene_parts(cfg: DictConfig) -> dict[str, Any]:
@@ -106,11 +109,24 @@ def scene_parts(cfg: DictConfig) -> dict[str, Any]:
     """
     task = cfg.task
     return {
-        "robot": _dataclass(RobotConfig, cfg.robot, "robot"),
+        "robot": _robot(cfg),
         "object": None if task.object is None else build(task.object, "task.object"),
         "scenery": [build(item, f"task.scenery[{i}]") for i, item in enumerate(task.scenery)],
         "effectors": [build(item, f"task.effectors[{i}]") for i, item in enumerate(task.effectors)],
     }
+
+
+def _robot(cfg: DictConfig) -> RobotConfig:
+    values = _container(cfg.robot)
+    if (unactuated := values.pop("unactuated", "reference")) == "default":
+        # what no pattern of the scale matches, the policy does not drive
+        scale = "action.joint_position.scale"
+        driven = match_names(list(cfg.action.joint_position.scale), g1.JOINT_NAMES, scale)
+        values["held"] = [name for i, name in enumerate(g1.JOINT_NAMES) if i not in driven]
+    elif unactuated != "reference":
+        raise ConfigError(f"robot.unactuated: expected 'reference' or 'default', got {unactuated!r}")
+    robot: RobotConfig = _dataclass(RobotConfig, values, "robot")
+    return robot
 
 
 def make_task(cfg: DictConfig) -> Task:
@@ -123,7 +139,8 @@ def make_task(cfg: DictConfig) -> Task:
     robot = parts.pop("robot")
     sim = _dataclass(SimConfig, {k: v for k, v in cfg.sim.items() if k not in ("device", "backend")}, "sim")
     task = cfg.task
-    reference = make_reference(find_motion(task.motion, cfg.motion_root), control_dt=sim.control_dt, **parts)
+    motion = find_motion(task.motion, cfg.motion_root)
+    reference = make_reference(motion, control_dt=sim.control_dt, robot=robot, **parts)
     try:
         scene = build_scene(robot, sim, **parts, placements=reference.placements)
     except ValueError as error:
@@ -160,7 +177,7 @@ def make_env(
     base = HumanoidObjectEnv(task.scene, num_envs or cfg.num_envs, backend or backend_of(cfg), pixels)
     here = replace(task, reference=task.reference.to(base.device))
     stack = Compose(*(transform for _, transform in make_transforms(cfg, here))).to(base.device)
-    env = (MaskedResetEnv if base.backend.masked else RowResetEnv)(base, stack)
+    env = (MaskedResetEnv if base.backend.masked else RowResetEnv)(base, stack, **cfg.starts)
     # raw keys are dropped, but for what steps read back and what learners and logs want
     state = set(env.full_state_spec.keys(True, True))
     entries = list(env.full_observation_spec.keys(True, True))
@@ -177,7 +194,9 @@ def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
     """The transforms of a config with the names of their nodes, from the base environment outwards."""
     context = {
         "reference": task.reference,
+        "scene": task.scene,
         "model": task.scene.model,
+        "default_pos": tuple(task.scene.default_qpos[task.scene.joint_qpos].tolist()),
         "robot_bodies": task.scene.body_ids.tolist(),
         "effectors": task.scene.effectors,
         "object_geoms": task.scene.object_geoms,

@@ -47,6 +47,7 @@ def author(options: Options, console: Console) -> tuple[Authored, Path]:
             parts["object"],
             parts["scenery"],
             parts["effectors"],
+            parts["robot"],
             on_frame=lambda frame, count: progress.update(bar, total=count, completed=frame + 1),
         )
     return authored, save_motion(authored.motion, Path(options.out) / plan.name)

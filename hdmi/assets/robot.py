@@ -63,6 +63,10 @@ class RobotConfig:
             `L` adds two thin boxes that hook over an edge.
         self_collisions: let robot geoms collide with each other (parent and child excepted).
         stiffness, damping: joint name pattern -> N m/rad and N m s/rad, instead of the servo table's values.
+        default_pose: joint name pattern -> rad, over the standing pose: where joints are that a motion lacks, what
+            observations and the action space without residual are relative to.
+        held: joint name patterns: these hold the default pose, whatever a motion says; see
+            `hdmi.motion.make_reference`.
         friction: sliding friction of all robot geoms.
         mesh_dir: folder with Unitree's `<body>.STL` files; used as visuals instead of primitives.
     """
@@ -72,8 +76,26 @@ class RobotConfig:
     self_collisions: bool = False
     stiffness: Mapping[str, float] = field(default_factory=dict)
     damping: Mapping[str, float] = field(default_factory=dict)
+    default_pose: Mapping[str, float] = field(default_factory=dict)
+    held: Sequence[str] = ()
     friction: float = 1.0
     mesh_dir: str | None = None
+
+    def __post_init__(self) -> None:
+        pose = self.default_joint_pos
+        for name, angle, (low, high) in zip(g1.JOINT_NAMES, pose, g1.JOINT_RANGES, strict=True):
+            if not low <= angle <= high:
+                raise ValueError(f"robot.default_pose: {name} at {angle:g} rad is outside of its range {low}..{high}")
+
+    @property
+    def default_joint_pos(self) -> np.ndarray:
+        """Joint angles of the default pose, rad. [29]"""
+        return per_joint(self.default_pose, default=default_joint_pos(), where="robot.default_pose")
+
+    @property
+    def held_joints(self) -> list[str]:
+        """Names of the joints that hold the default pose, in table order."""
+        return [g1.JOINT_NAMES[i] for i in match_names(self.held, g1.JOINT_NAMES, "robot.held")]
 
 
 def match_names(patterns: Sequence[str], names: Sequence[str], where: str = "names") -> list[int]:

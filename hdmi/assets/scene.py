@@ -11,10 +11,10 @@ import numpy as np
 
 from hdmi.assets import g1
 from hdmi.assets.objects import ObjectConfig, SceneryConfig, add_object, add_scenery
-from hdmi.assets.robot import ROBOT_BIT, WORLD_BIT, RobotConfig, add_robot, default_joint_pos
+from hdmi.assets.robot import ROBOT_BIT, WORLD_BIT, RobotConfig, add_robot
 
 Pose = tuple[Sequence[float], Sequence[float]]
-_NETFORCE = 3  # contact sensor reduction: sum of all matching contacts, in the world frame
+_MINDIST, _NETFORCE = 1, 3  # contact sensor reductions: the deepest contact; the sum of all, in the world frame
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,8 @@ class Scene:
     joint_dof: np.ndarray  # [J]
     foot_sensors: np.ndarray  # [2, 3] addresses in sensordata
     effector_sensors: np.ndarray  # [E, 3]
+    penetration_sensor: int | None  # address of the smallest distance of the object's contacts, m; 0 without contact
+    scenery_bodies: np.ndarray  # [S] ids
     object_body: int | None
     object_link: int | None  # the body that contact points are fixed to
     object_free_qpos: int | None  # address of the free joint; None when fixed or absent
@@ -130,7 +132,7 @@ def build_scene(
     # not in model.qpos0: hinges turn by qpos - qpos0
     default_qpos = model.qpos0.copy()
     default_qpos[2] = g1.ROOT_HEIGHT
-    default_qpos[model.jnt_qposadr[joint_ids]] = default_joint_pos()
+    default_qpos[model.jnt_qposadr[joint_ids]] = robot.default_joint_pos
     link = None if object is None else model.body(object.link).id
     hinge = None if object is None or object.hinge is None else model.joint(object.hinge.name).id
     free = None if object is None or object.fixed_base else model.joint("object_root").id
@@ -146,6 +148,8 @@ def build_scene(
         joint_dof=model.jnt_dofadr[joint_ids].copy(),
         foot_sensors=_sensor_addresses(model, [f"{foot}_force" for foot in g1.FEET]),
         effector_sensors=_sensor_addresses(model, [f"effector{i}_force" for i in range(len(effectors))]),
+        penetration_sensor=None if object is None else int(model.sensor("object_penetration").adr[0]),
+        scenery_bodies=np.array([model.body(item.name).id for item in scenery], dtype=int),
         object_body=body,
         object_link=link,
         object_free_qpos=None if free is None else int(model.jnt_qposadr[free]),
@@ -217,6 +221,14 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
 def _add_contact_sensors(spec: mujoco.MjSpec, object: ObjectConfig | None, effectors: Sequence[Effector]) -> None:
     force = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
     common = {"type": mujoco.mjtSensor.mjSENS_CONTACT, "intprm": [force, _NETFORCE, 1]}
+    if object is not None:
+        spec.add_sensor(
+            name="object_penetration",
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_XBODY,
+            objname=object.name,
+            intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_DIST), _MINDIST, 1],
+        )
     for foot in g1.FEET:
         spec.add_sensor(name=f"{foot}_force", objtype=mujoco.mjtObj.mjOBJ_BODY, objname=foot, **common)
     for i, effector in enumerate(effectors):

@@ -45,7 +45,8 @@ class HumanoidObjectEnv(EnvBase):
 
     Reads on reset, all optional, under `init`: `root_pos`, `root_quat`, `root_lin_vel`, `root_ang_vel` (world),
         `joint_pos`, `joint_vel`, `object_pos`, `object_quat`, `object_lin_vel`, `object_ang_vel`,
-        `object_joint_pos`, `object_joint_vel`, `object_scale` [N, 1], and `model/<MjModel field>` [N, ...].
+        `object_joint_pos`, `object_joint_vel`, `object_scale` [N, 1], `scenery_pos` [N, S, 3] of the S pieces of
+        scenery, and `model/<MjModel field>` [N, ...].
         What is not given is the model's default.
 
     Args:
@@ -100,6 +101,7 @@ class HumanoidObjectEnv(EnvBase):
 
         self._diverged = torch.zeros((), dtype=torch.int64, device=self.device)
         self._everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        self._scenery = constant(scene.scenery_bodies)
         self._object_scale = torch.ones(self.num_envs, 1, device=self.device)
         self._default_qpos = constant(scene.default_qpos).to(self.backend.data("qpos").dtype)
         self._body_root = constant(model.body_rootid).long()
@@ -291,6 +293,11 @@ class HumanoidObjectEnv(EnvBase):
             for field, index in self._scaled.items():
                 assign(self.backend.model(field)[:, index], worlds, scale.unsqueeze(-1) * self._unscaled[field])
             commit = True
+        scenery = init.get("scenery_pos", None)
+        if scenery is not None:  # static: no constant depends on where they are
+            rows = self.backend.model("body_pos")[:, self._scenery]
+            assign(rows, worlds, scenery)
+            self.backend.model("body_pos")[:, self._scenery] = rows
         if commit:
             self.backend.commit_model(worlds)
 
@@ -357,6 +364,11 @@ class HumanoidObjectEnv(EnvBase):
             frames = np.stack([self.render(i, *self._pixels) for i in worlds])
             out.set("pixels", torch.from_numpy(frames).to(self.device))
         return out
+
+    def penetration(self) -> Tensor:
+        """Depth of the object's deepest contact in each world, m, as its state was last refreshed by a reset. [N]"""
+        sensors, address = self.backend.data("sensordata"), self.scene.penetration_sensor
+        return sensors.new_zeros(self.num_envs) if address is None else -sensors[:, address].clamp(max=0)
 
     def _default_state(self) -> TensorDict:
         """What any world shows in the default state. Batch [N], one row's memory."""

@@ -7,8 +7,9 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from torchrl.envs import TransformedEnv
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase, Transform, TransformedEnv
 
 _ENVS_PER_THREAD = 4096  # with 2048, a second thread saves 0.4 ms of a step and costs physics 8
 
@@ -35,13 +36,88 @@ class RowResetEnv(TransformedEnv):
     then costs twice. Here base environment and transforms are given the n rows, with their numbers
     under `worlds` int64 [n], and results are written into copies of the others' tensors. `reset` itself is unchanged.
 
+    A start whose deepest contact exceeds `max_penetration` is drawn again, up to `redraws` times: from the same frame, each
+    time with less of its noise, at last with none (see `ReferenceStateInitialization`). How many were is counted in
+    `num_redrawn`, and how many stayed too deep all the same in `num_deep`.
+
     While it steps, torch has one thread per 4096 environments; see `torch_threads`.
 
     `compile_transforms` compiles the stack with `torch.compile`.
 
     The base environment must have `reset_rows` (see `HumanoidObjectEnv`), and transforms must take the batch size
     from the tensordict.
+
+    Args:
+        env, transform: as for `TransformedEnv`.
+        max_penetration: m. redraws: at most; with 0 every start is taken as it comes.
     """
+
+    def __init__(self, env: EnvBase, transform: Transform, *, max_penetration: float = 0.02, redraws: int = 0):
+        super().__init__(env, transform)
+        self.max_penetration, self.redraws = max_penetration, redraws
+        self._counts = torch.zeros(2, dtype=torch.int64, device=env.device)
+
+    @property
+    def num_redrawn(self) -> int:
+        """Starts that were drawn again so far. Reading it waits for the device."""
+        return int(self._counts[0])
+
+    @property
+    def num_deep(self) -> int:
+        """Starts so far whose last drawing, too, was too deep. Reading it waits for the device."""
+        return int(self._counts[1])
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        keys = [*self.reset_keys, *self.state_spec.keys(True, True)]
+        tensordict = None if tensordict is None else tensordict.select(*keys, strict=False)
+        start = self.transform._reset_env_preprocess(tensordict)
+        fresh = self.base_env._reset(start, **kwargs)
+        start = fresh.empty() if start is None else start
+        mask = start.get("_reset", None)
+        if mask is None:
+            mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+        return self.transform._reset(start, self._redraw_masked(start, fresh, mask.reshape(-1)))
+
+    def _redraw_masked(self, start: TensorDictBase, fresh: TensorDictBase, mask: Tensor) -> TensorDictBase:
+        """Draws starts of the worlds in the mask again where they are too deep. Batch [N], bool [N]"""
+        worlds = mask.nonzero().squeeze(-1)
+        if self.redraws and len(worlds):
+            fresh[worlds] = self._redraw(start[worlds], fresh[worlds], worlds)
+        return fresh
+
+    def _redraw(self, start: TensorDictBase, fresh: TensorDictBase, worlds: Tensor) -> TensorDictBase:
+        """Draws starts again where they are too deep.
+
+        Args:
+            start: what the worlds were reset to, with `init`, batch [n].
+            fresh: the base environment's state after that, batch [n].
+            worlds: their numbers, int64 [n].
+
+        Returns:
+            The base environment's state after the last drawing, batch [n].
+        """
+        for attempt in range(1, self.redraws + 1):
+            rows = self._too_deep(worlds).nonzero().squeeze(-1)
+            if not len(rows):
+                return fresh
+            self._counts[0] += len(rows)
+            again = self._same_frames(start[rows], attempt).set("worlds", worlds[rows])
+            fresh[rows] = self.base_env.reset_rows(self.transform._reset_env_preprocess(again))
+        if self.redraws:
+            self._counts[1] += self._too_deep(worlds).sum()
+        return fresh
+
+    def _too_deep(self, worlds: Tensor | slice = slice(None)) -> Tensor:
+        return self.base_env.penetration()[worlds] > self.max_penetration
+
+    def _same_frames(self, start: TensorDictBase, attempt: int) -> TensorDictBase:
+        """A start to draw again: what came before, the frame, and how much of the noise is left."""
+        init = TensorDict({}, batch_size=start.batch_size, device=start.device)
+        init.set("noise_share", torch.full((*start.batch_size, 1), 1 - attempt / self.redraws, device=start.device))
+        frame = start.get(("init", "frame"), None)
+        if frame is not None:
+            init.set("frame", frame)
+        return start.exclude("init").set("init", init)
 
     def compile_transforms(self, **options: Any) -> None:
         """Compiles what the transforms do in a step and in a reset of rows; the stack must be complete.
@@ -87,9 +163,10 @@ class RowResetEnv(TransformedEnv):
             part = tensordict[worlds].set("worlds", worlds)
             tensordict = tensordict.exclude("_reset")
             part = self.transform._reset_env_preprocess(part)
+            state = self._redraw(part, self.base_env.reset_rows(part), worlds)
             # a kernel for n rows would be compiled anew for one
             reset = self._reset_transforms if len(worlds) > 1 else self.transform._reset
-            fresh = reset(part, self.base_env.reset_rows(part))
+            fresh = reset(part, state)
             for key, value in fresh.items(True, True):
                 # out of place: the collector keeps references to the last step's tensors
                 tensordict.set(key, tensordict.get(key).index_copy(0, worlds, value))
@@ -114,13 +191,25 @@ class MaskedResetEnv(RowResetEnv):
             compiled = torch.compile(getattr(self.transform, name), dynamic=False, **options)
             setattr(self.transform, name, torch.no_grad()(compiled))
 
+    def _redraw_masked(self, start: TensorDictBase, fresh: TensorDictBase, mask: Tensor) -> TensorDictBase:
+        for attempt in range(1, self.redraws + 1):
+            deep = mask & self._too_deep()
+            self._counts[0] += deep.sum()
+            again = self.transform._reset_env_preprocess(self._same_frames(start, attempt))
+            again = self.base_env._reset(again.set("_reset", deep.unsqueeze(-1)))
+            fresh = again.where(deep, fresh)
+        if self.redraws:
+            self._counts[1] += (mask & self._too_deep()).sum()
+        return fresh
+
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         done = tensordict.get("done")
         if done.device.type == "cpu" and not done.any():
             return tensordict
+        mask = done.reshape(-1)
         part = self.transform._reset_env_preprocess(tensordict.copy())
-        fresh = self.transform._reset(part, self.base_env._reset(part.copy().set("_reset", done)))
-        tensordict, mask = tensordict.copy(), done.reshape(-1)
+        state = self._redraw_masked(part, self.base_env._reset(part.copy().set("_reset", done)), mask)
+        fresh, tensordict = self.transform._reset(part, state), tensordict.copy()
         for key, value in fresh.items(True, True):
             chosen = mask.reshape(-1, *[1] * (value.ndim - 1))
             tensordict.set(key, torch.where(chosen, value, tensordict.get(key)))

@@ -176,6 +176,9 @@ def make_playback(
     """
     if motion.object_contact is None and effectors:
         motion = replace(motion, object_contact=np.zeros((motion.num_frames, len(effectors)), bool))
-    reference = make_reference(motion, control_dt=1 / motion.fps, object=object, scenery=scenery, effectors=effectors)
-    scene = build_scene(robot or RobotConfig(), SimConfig(), object, scenery, effectors, reference.placements)
+    robot = robot or RobotConfig()
+    reference = make_reference(
+        motion, control_dt=1 / motion.fps, object=object, scenery=scenery, effectors=effectors, robot=robot
+    )
+    scene = build_scene(robot, SimConfig(), object, scenery, effectors, reference.placements)
     return Playback(motion, reference, scene, reference_qpos(scene, reference))

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hdmi.assets import Effector, ObjectConfig, SceneryConfig, default_joint_pos, g1
+from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig, g1
 from hdmi.motion.kinematics import (
     angular_velocity,
     derivative,
@@ -90,11 +90,12 @@ def make_reference(
     object: ObjectConfig | None = None,
     scenery: Sequence[SceneryConfig] = (),
     effectors: Sequence[Effector] = (),
+    robot: RobotConfig | None = None,
 ) -> Reference:
     """Completes a motion to a reference: table order, control rate, all joints and bodies.
 
-    Joints that the motion lacks hold the default pose; bodies that it lacks come from forward kinematics. The
-    object's name and hinge, the scenery and the effectors are the task's. Linear velocities are differences of
+    Joints that the motion lacks hold the robot's default pose, and so do those that the robot holds there whatever a
+    motion says; bodies that it lacks, or that these joints move, come from forward kinematics. The object's name and hinge, the scenery and the effectors are the task's. Linear velocities are differences of
     positions: the simulator's are of the bodies' origins, those in files often of their centres of mass.
 
     Raises:
@@ -108,7 +109,7 @@ def make_reference(
     if unknown:
         raise MotionError(f"{where}: joint_names: {unknown} are neither the robot's nor the object's hinge ({hinge!r})")
     motion = replace(motion, body_lin_vel_w=derivative(motion.body_pos_w, motion.fps))
-    motion = complete_robot(resample(motion, 1.0 / control_dt))
+    motion = complete_robot(resample(motion, 1.0 / control_dt), robot)
     num_frames = motion.num_frames
     num_joints, num_bodies = len(g1.JOINT_NAMES), len(g1.BODY_NAMES)
 
@@ -159,10 +160,11 @@ def make_reference(
     )
 
 
-def complete_robot(motion: Motion) -> Motion:
+def complete_robot(motion: Motion, robot: RobotConfig | None = None) -> Motion:
     """The motion with all joints and bodies of the robot table, first and in its order; others follow.
 
-    Joints that it lacks hold the default pose, bodies that it lacks come from forward kinematics.
+    Joints that it lacks or that the robot holds there are at the default pose; bodies that it lacks or that these move
+    come from forward kinematics.
 
     Raises:
         MotionError: if it lacks the pelvis, or has no joint of the robot.
@@ -173,18 +175,21 @@ def complete_robot(motion: Motion) -> Motion:
     if not any(name in g1.JOINT_NAMES for name in motion.joint_names):
         raise MotionError(f"{where}: joint_names has no joint of the robot")
     fps, num_frames = motion.fps, motion.num_frames
-    joint_pos = np.tile(default_joint_pos(), (num_frames, 1))
+    robot = robot or RobotConfig()
+    held = robot.held_joints
+    joint_pos = np.tile(robot.default_joint_pos, (num_frames, 1))
     joint_vel = np.zeros_like(joint_pos)
     for i, name in enumerate(motion.joint_names):
-        if name in g1.JOINT_NAMES:
+        if name in g1.JOINT_NAMES and name not in held:
             j = g1.JOINT_NAMES.index(name)
             joint_pos[:, j], joint_vel[:, j] = motion.joint_pos[:, i], motion.joint_vel[:, i]
 
     root = motion.body_names.index("pelvis")
     pos, quat = forward_kinematics(motion.body_pos_w[:, root], motion.body_quat_w[:, root], joint_pos)
     lin_vel, ang_vel = derivative(pos, fps), angular_velocity(quat, fps)
+    moved = _bodies_after(held)
     for b, name in enumerate(g1.BODY_NAMES):
-        if name in motion.body_names:
+        if name in motion.body_names and name not in moved:
             i = motion.body_names.index(name)
             pos[:, b], quat[:, b] = motion.body_pos_w[:, i], motion.body_quat_w[:, i]
             lin_vel[:, b], ang_vel[:, b] = motion.body_lin_vel_w[:, i], motion.body_ang_vel_w[:, i]
@@ -206,6 +211,15 @@ def complete_robot(motion: Motion) -> Motion:
         body_lin_vel_w=joined(lin_vel, motion.body_lin_vel_w[:, bodies]),
         body_ang_vel_w=joined(ang_vel, motion.body_ang_vel_w[:, bodies]),
     )
+
+
+def _bodies_after(joints: Sequence[str]) -> set[str]:
+    """The robot's bodies that joints move."""
+    moved = {joint.body for joint in g1.JOINTS if joint.name in joints}
+    for body in g1.BODIES:  # parents come first
+        if body.parent in moved:
+            moved.add(body.name)
+    return moved
 
 
 def _contacts(motion: Motion, effectors: Sequence[Effector]) -> tuple[np.ndarray, np.ndarray]:

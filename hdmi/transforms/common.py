@@ -145,6 +145,13 @@ def add_state_specs(input_spec: Composite, specs: Mapping[NestedKey, TensorSpec]
     return input_spec
 
 
+def soft_limits(limits: Sequence[Sequence[float]], share: float) -> tuple[Tensor, Tensor]:
+    """Ends of a share of each range, about its middle. [J, 2] -> [J], [J]"""
+    low, high = torch.tensor([list(pair) for pair in limits], dtype=torch.float32).unbind(-1)
+    middle, half = (low + high) / 2, (high - low) / 2 * share
+    return middle - half, middle + half
+
+
 def set_terminated(next_tensordict: TensorDictBase, flag: Tensor, key: str = "terminated") -> None:
     """Raises `terminated` (or `truncated`) where `flag`, and `done` with it: `any_done` reads only `done`."""
     present = next_tensordict.get(key, None)

@@ -10,12 +10,21 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
-from hdmi.assets import g1, match_names
+from hdmi.assets import Scene, g1, match_names
 from hdmi.functional import local_pose, quat_from_euler, quat_multiply
 from hdmi.motion import Reference
-from hdmi.transforms.common import SpecTransform, StateTransform, add_state_specs, set_terminated, spec_like
+from hdmi.motion.starts import start_tables
+from hdmi.transforms.common import (
+    SpecTransform,
+    StateTransform,
+    add_state_specs,
+    set_terminated,
+    soft_limits,
+    spec_like,
+)
 
 FRAME_KEY: NestedKey = ("init", "frame")
+NOISE_SHARE_KEY: NestedKey = ("init", "noise_share")
 
 
 def _uniform(shape: Sequence[int], half_range: Tensor | float, device: torch.device | None) -> Tensor:
@@ -135,8 +144,14 @@ def _reference_table(
 class ReferenceStateInitialization(SpecTransform):
     """Starts episodes from frames of the reference with small random perturbations (section III-B, (1)).
 
-    Writes on reset, before the base environment resets: `init/frame` and the state under `init` that
-    `HumanoidObjectEnv` reads. It has no effect between resets.
+    Starts are consistent: in a world whose object is s times as large its lowest point stays where it was, hands and
+    feet that touch it still do (to first order in s - 1), the support that an object stands on moves with it, and
+    joints are within their soft limits.
+
+    Reads on reset, all optional: `init/object_scale` [N, 1], which transforms farther out draw; `init/frame` int64
+    [N, 1], where to start instead of at a drawn frame; `init/noise_share` [N, 1], factor of all perturbations.
+    Writes, before the base environment resets: `init/frame` and the state under `init` that `HumanoidObjectEnv` reads.
+    It has no effect between resets.
 
     Args:
         reference: where to start from.
@@ -147,6 +162,8 @@ class ReferenceStateInitialization(SpecTransform):
             joint_pos (rad), joint_vel; object_pos [3], object_rpy [3], object_joint (rad). Absent means none.
         held_noise: factor of the object's perturbations at frames where contact is intended: an object between two
             hands cannot be somewhere else.
+        soft_limit: share of the joint ranges, about their middles, that starts stay in.
+        scene: of the environment; without it the object's size changes nothing, and no support moves.
     """
 
     _NOISES = (
@@ -162,6 +179,9 @@ class ReferenceStateInitialization(SpecTransform):
         noise: Mapping[str, float | Sequence[float]] | None = None,
         held_noise: float = 1.0,
         first_share: float = 0.0,
+        soft_limit: float = 0.95,
+        limits: Sequence[Sequence[float]] = g1.JOINT_RANGES,
+        scene: Scene | None = None,
     ):
         super().__init__()
         if start not in ("uniform", "first"):
@@ -177,6 +197,18 @@ class ReferenceStateInitialization(SpecTransform):
         for name in self._NOISES:
             value = torch.as_tensor((noise or {}).get(name, 0.0), dtype=torch.float32)
             self.register_buffer(f"noise_{name}", value, persistent=False)
+        low, high = soft_limits(limits, soft_limit)
+        self.register_buffer("low", low, persistent=False)
+        self.register_buffer("high", high, persistent=False)
+        tables = None if scene is None or not reference.has_object else start_tables(scene, reference)
+        self.has_tables, self.moves_scenery = tables is not None, False
+        if tables is not None:
+            assert scene is not None
+            for name in ("object_height", "root_pos", "joint_pos", "carries"):
+                self.register_buffer(f"scaled_{name}", getattr(tables, name), persistent=False)
+            places = torch.from_numpy(scene.model.body_pos[scene.scenery_bodies]).float()  # [S, 3]
+            self.register_buffer("scenery_pos", places, persistent=False)
+            self.moves_scenery = bool(tables.carries.any())
 
     def sample_frames(self, batch_size: torch.Size, device: torch.device | None) -> Tensor:
         """Start frames. int64 [*batch_size]"""
@@ -191,35 +223,55 @@ class ReferenceStateInitialization(SpecTransform):
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         if tensordict is None:
             tensordict = TensorDict({}, batch_size=self.parent.batch_size, device=self.parent.device)
-        batch_size, device = tensordict.batch_size, tensordict.device
-        frames = self._start_frames(batch_size, device)
-        tensordict.set(FRAME_KEY, frames.unsqueeze(-1))
-        for key, value in self.initial_state(frames).items():
+        frames = tensordict.get(FRAME_KEY, None)
+        if frames is None:
+            frames = self._start_frames(tensordict.batch_size, tensordict.device).unsqueeze(-1)
+            tensordict.set(FRAME_KEY, frames)
+        scale, noise_share = tensordict.get(("init", "object_scale"), None), tensordict.get(NOISE_SHARE_KEY, None)
+        for key, value in self.initial_state(frames.squeeze(-1), scale, noise_share).items():
             tensordict.set(("init", key), value)
         return tensordict
 
-    def initial_state(self, frames: Tensor) -> dict[str, Tensor]:
-        """Perturbed state of the given frames. int64 [N] -> tensors [N, ...]"""
+    def initial_state(
+        self, frames: Tensor, scale: Tensor | None = None, noise_share: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Perturbed state of the given frames. int64 [N] -> tensors [N, ...]
+
+        Args:
+            scale: of the object, [N, 1]. noise_share: factor of the perturbations, [N, 1].
+        """
         ref, device = self.reference, frames.device
 
         def noise(name: str, like: Tensor) -> Tensor:
-            return _uniform(like.shape, getattr(self, f"noise_{name}"), device)
+            drawn = _uniform(like.shape, getattr(self, f"noise_{name}"), device)
+            return drawn if noise_share is None else noise_share * drawn
+
+        def grown(name: str) -> Tensor | float:
+            """What the object's size adds."""
+            if scale is None or not self.has_tables:
+                return 0.0
+            return (scale - 1) * getattr(self, f"scaled_{name}")[frames]
 
         root_pos, root_quat = ref.body_pos[frames, 0], ref.body_quat[frames, 0]
         root_lin_vel, root_ang_vel = ref.body_lin_vel[frames, 0], ref.body_ang_vel[frames, 0]
         joint_pos, joint_vel = ref.joint_pos[frames], ref.joint_vel[frames]
         state = {
-            "root_pos": root_pos + noise("root_pos", root_pos),
+            "root_pos": root_pos + grown("root_pos") + noise("root_pos", root_pos),
             "root_quat": quat_multiply(root_quat, quat_from_euler(noise("root_rpy", root_pos))),
             "root_lin_vel": root_lin_vel + noise("root_lin_vel", root_pos),
             "root_ang_vel": root_ang_vel + noise("root_ang_vel", root_pos),
-            "joint_pos": joint_pos + noise("joint_pos", joint_pos),
+            "joint_pos": torch.clamp(
+                joint_pos + grown("joint_pos") + noise("joint_pos", joint_pos), self.low, self.high
+            ),
             "joint_vel": joint_vel + noise("joint_vel", joint_vel),
         }
         if ref.has_object:
             pos, quat, share = ref.object_pos[frames], ref.object_quat[frames], self.object_noise[frames]
+            moved = share * noise("object_pos", pos)
+            place = pos + moved
+            place[..., 2:] += grown("object_height")
             state |= {
-                "object_pos": pos + share * noise("object_pos", pos),
+                "object_pos": place,
                 "object_quat": quat_multiply(quat, quat_from_euler(share * noise("object_rpy", pos))),
                 "object_lin_vel": ref.object_lin_vel[frames],
                 "object_ang_vel": ref.object_ang_vel[frames],
@@ -228,6 +280,10 @@ class ReferenceStateInitialization(SpecTransform):
                 joint = ref.object_joint_pos[frames]
                 state["object_joint_pos"] = joint + share * noise("object_joint", joint)
                 state["object_joint_vel"] = ref.object_joint_vel[frames]
+            if self.moves_scenery:
+                state["scenery_pos"] = self.scenery_pos + self.scaled_carries[frames].unsqueeze(-1) * moved.unsqueeze(
+                    -2
+                )
         return state
 
 
@@ -239,8 +295,8 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
 
     Args:
         start: `uniform` as long as nothing has failed, or `first`, always.
-        bins: number of bins. uniform_share: of starts that ignore failures. decay: of the average, per termination
-            batch. lead: frames before the failure's bin that the start is moved ahead.
+        bins: number of bins. uniform_share: of starts that ignore failures. decay: of the average, per reset in
+            which any episode has ended. lead: frames before the failure's bin that the start is moved ahead.
     """
 
     def __init__(
@@ -251,12 +307,15 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
         noise: Mapping[str, float | Sequence[float]] | None = None,
         held_noise: float = 1.0,
         first_share: float = 0.0,
+        soft_limit: float = 0.95,
+        limits: Sequence[Sequence[float]] = g1.JOINT_RANGES,
+        scene: Scene | None = None,
         bins: int = 20,
         uniform_share: float = 0.5,
         decay: float = 0.999,
         lead: int = 25,
     ):
-        super().__init__(reference, start, margin, noise, held_noise, first_share)
+        super().__init__(reference, start, margin, noise, held_noise, first_share, soft_limit, limits, scene)
         self.uniform_share, self.decay, self.lead = uniform_share, decay, lead
         self.register_buffer("failures", torch.zeros(bins))
 
@@ -271,12 +330,19 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
         within = torch.rand(tuple(batch_size), device=device)
         return ((drawn + within) / bins * self.num_starts).long().clamp(max=self.num_starts - 1)
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        terminated = next_tensordict.get("terminated").squeeze(-1)
-        frames = (next_tensordict.get(("ref", "step")).squeeze(-1) - self.lead).clamp(min=0)
+    def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
+        # a start that is drawn again has been counted
+        if tensordict is not None and NOISE_SHARE_KEY not in tensordict.keys(True):
+            self._count(tensordict.get("terminated", None), tensordict.get(("ref", "step"), None))
+        return super()._reset_env_preprocess(tensordict)
+
+    def _count(self, terminated: Tensor | None, step: Tensor | None) -> None:
+        """Counts the episodes that ended in failure. bool [N, 1], int64 [N, 1]"""
+        if terminated is None or step is None:  # of the first reset
+            return
+        frames = (step.squeeze(-1) - self.lead).clamp(min=0)
         bins = (frames * len(self.failures) // self.num_starts).clamp(max=len(self.failures) - 1)
-        self.failures.mul_(self.decay).index_add_(0, bins, terminated.float())
-        return next_tensordict
+        self.failures.mul_(self.decay).index_add_(0, bins, terminated.squeeze(-1).float())
 
 
 class MotionEnd(SpecTransform):

@@ -12,7 +12,7 @@ from torchrl.data import TensorSpec
 
 from hdmi import functional as F
 from hdmi.assets import g1, match_names
-from hdmi.transforms.common import SpecTransform
+from hdmi.transforms.common import SpecTransform, soft_limits
 
 
 def _keys(keys: Sequence[NestedKey | Sequence[str]]) -> list[NestedKey]:
@@ -169,10 +169,9 @@ class JointPosLimitsL1(RewardTerm):
         reward_key: NestedKey = "reward",
     ):
         super().__init__(name, [joint_pos_key], weight, reward_key)
-        low, high = torch.tensor([list(pair) for pair in limits], dtype=torch.float32).unbind(-1)
-        middle, half = (low + high) / 2, (high - low) / 2 * soft_limit
-        self.register_buffer("low", middle - half, persistent=False)
-        self.register_buffer("high", middle + half, persistent=False)
+        low, high = soft_limits(limits, soft_limit)
+        self.register_buffer("low", low, persistent=False)
+        self.register_buffer("high", high, persistent=False)
 
     def function(self, *inputs: Tensor) -> Tensor:
         return F.limit_excess(inputs[0], self.low, self.high)

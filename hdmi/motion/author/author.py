@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdmi.assets import Effector, ObjectConfig, SceneryConfig, default_joint_pos, g1, per_joint
+from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig, g1, per_joint
 from hdmi.assets.objects import add_object
 from hdmi.motion import ik
 from hdmi.motion.author.balance import Load, centre_of_pressure, pendulum_com
@@ -30,6 +30,7 @@ REST_POINT = (0.1, 0.0, 0.0)  # of a hand that is no end effector of the task
 FOOT_WEIGHT = (50.0, 20.0)
 COM_WEIGHT, PELVIS_WEIGHT, HAND_WEIGHT = 10.0, (2.0, 0.5), (10.0, 3.0)
 TORSO_WEIGHT = 1.0
+HELD_WEIGHT, HELD_HAND_WEIGHT = 30.0, 0.1  # of joints that hold the default pose; of hands' orientations beyond these
 LEG_POSTURE_WEIGHT = 0.02
 LIMIT_MARGIN = 0.06  # rad
 MAX_MISS = {"hand": 0.03, "foot": 0.01}  # m; beyond, a plan is out of reach
@@ -69,11 +70,14 @@ def author_motion(
     object: ObjectConfig | None = None,
     scenery: Sequence[SceneryConfig] = (),
     effectors: Sequence[Effector] = (),
+    robot: RobotConfig | None = None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Authored:
-    """Solves a plan for a task's object, scenery and end effectors.
+    """Solves a plan for a task's object, scenery, end effectors and robot.
 
     Args:
+        robot: whose default pose resolves what the plan leaves open. Where it holds wrists there, hands turn as far as
+            arms turn them.
         on_frame: called with the index of every frame of the last pass once it is solved, and their number.
 
     Raises:
@@ -81,9 +85,10 @@ def author_motion(
         ImportError: without the extra `retarget`.
     """
     time = np.arange(round(plan.duration * FPS)) / FPS
+    robot = robot or RobotConfig()
     paths = _lay_out(plan, time, object, scenery, effectors)
-    body = [*_foot_targets(paths), *_body_targets(plan, paths)]
-    hands, contact = _hand_targets(plan, paths, time, effectors, body)
+    body = [*_foot_targets(paths), *_body_targets(plan, paths, robot)]
+    hands, contact = _hand_targets(plan, paths, time, effectors, body, robot)
     contact |= paths.contact
     load = _load(plan, paths, time, object, hands)
     com = _com(paths, load, time)
@@ -238,11 +243,12 @@ def _foot_targets(paths: _Paths) -> list[ik.Target]:
     ]
 
 
-def _body_targets(plan: Plan, paths: _Paths) -> list[ik.Target]:
+def _body_targets(plan: Plan, paths: _Paths, robot: RobotConfig) -> list[ik.Target]:
     height = paths.root.pos[:, 2] + paths.pelvis_height
     pelvis_pos = np.column_stack([paths.root.pos[:, :2], height])
-    posture = per_joint(plan.posture, default=default_joint_pos(), where=f"{plan.file}: posture")
-    weight = per_joint({".*_(shoulder_.*|elbow|wrist_.*)_joint": plan.arm_posture}, default=LEG_POSTURE_WEIGHT)
+    posture = per_joint(plan.posture, default=robot.default_joint_pos, where=f"{plan.file}: posture")
+    arms = {".*_(shoulder_.*|elbow|wrist_.*)_joint": plan.arm_posture}
+    weight = per_joint(arms | dict.fromkeys(robot.held_joints, HELD_WEIGHT), default=LEG_POSTURE_WEIGHT)
     return [
         ik.PointTarget("pelvis", pelvis_pos, (0.0, 0.0, PELVIS_WEIGHT[0])),
         ik.OrientationTarget("pelvis", paths.pelvis.as_quat(scalar_first=True), PELVIS_WEIGHT[1]),
@@ -252,11 +258,17 @@ def _body_targets(plan: Plan, paths: _Paths) -> list[ik.Target]:
 
 
 def _hand_targets(
-    plan: Plan, paths: _Paths, time: np.ndarray, effectors: Sequence[Effector], body: Sequence[ik.Target]
+    plan: Plan,
+    paths: _Paths,
+    time: np.ndarray,
+    effectors: Sequence[Effector],
+    body: Sequence[ik.Target],
+    robot: RobotConfig,
 ) -> tuple[list[ik.Target], np.ndarray]:
     contact = np.zeros((len(time), len(effectors)), bool)
     targets: list[ik.Target] = []
     rest = _rest_pose(paths, body)
+    turning = HELD_HAND_WEIGHT if any("wrist" in name for name in robot.held_joints) else HAND_WEIGHT[1]
     for side, name in HANDS.items():
         effector = next((e for e in effectors if e.body == name), None)
         own = REST_POINT if effector is None else tuple(effector.point)
@@ -270,7 +282,7 @@ def _hand_targets(
         path, touches = pose_path(keys, frames, time, target)
         targets += [
             ik.PointTarget(name, path.pos, HAND_WEIGHT[0], point=point),
-            ik.OrientationTarget(name, path.quat, HAND_WEIGHT[1]),
+            ik.OrientationTarget(name, path.quat, turning),
         ]
         if effector is not None:
             contact[:, list(effectors).index(effector)] = touches
