@@ -187,8 +187,8 @@ class TestAdaptiveStateInitialization:
     def fail_at(self, init, *frames: int, terminated: bool = True) -> None:
         n = len(frames)
         step = torch.tensor(frames).unsqueeze(-1)
-        following = TensorDict({"ref": {"step": step}, "terminated": torch.full((n, 1), terminated)}, batch_size=[n])
-        init._step(TensorDict({}, batch_size=[n]), following)
+        ended = TensorDict({"ref": {"step": step}, "terminated": torch.full((n, 1), terminated)}, batch_size=[n])
+        init._reset_env_preprocess(ended)
 
     def test_uniform_at_the_start(self, reference):
         close(self.shares(self.make(reference)), [0.1] * 10, 0.015)

@@ -36,9 +36,9 @@ class RowResetEnv(TransformedEnv):
     then costs twice. Here base environment and transforms are given the n rows, with their numbers
     under `worlds` int64 [n], and results are written into copies of the others' tensors. `reset` itself is unchanged.
 
-    A start whose deepest contact exceeds `max_penetration` is drawn again, up to `redraws` times: from the same frame, each
-    time with less of its noise, at last with none (see `ReferenceStateInitialization`). How many were is counted in
-    `num_redrawn`, and how many stayed too deep all the same in `num_deep`.
+    A start in which the object's deepest contact exceeds `max_penetration` is drawn again, up to `redraws` times: from
+    the same frame, each time with less of its noise, at last with none (see `ReferenceStateInitialization`). How many
+    were is counted in `num_redrawn`, and how many stayed too deep all the same in `num_deep`.
 
     While it steps, torch has one thread per 4096 environments; see `torch_threads`.
 

@@ -95,8 +95,9 @@ def make_reference(
     """Completes a motion to a reference: table order, control rate, all joints and bodies.
 
     Joints that the motion lacks hold the robot's default pose, and so do those that the robot holds there whatever a
-    motion says; bodies that it lacks, or that these joints move, come from forward kinematics. The object's name and hinge, the scenery and the effectors are the task's. Linear velocities are differences of
-    positions: the simulator's are of the bodies' origins, those in files often of their centres of mass.
+    motion says; bodies that it lacks, or that these joints move, come from forward kinematics. The object's name and
+    hinge, the scenery and the effectors are the task's. Linear velocities are differences of positions: the
+    simulator's are of the bodies' origins, those in files often of their centres of mass.
 
     Raises:
         MotionError: if the motion has joints or bodies that nothing knows, lacks the pelvis, the object, its

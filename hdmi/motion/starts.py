@@ -1,4 +1,4 @@
-"""What starts from a reference depend on: how robot and object move when the object is larger, which support it stands on.
+"""What starts from a reference depend on: how robot and object move with the object's size, and what it stands on.
 
 A reference is made for an object of one size. In a world whose object is s times as large it would stand in its support
 or float, the hands would be inside of it or beside it, and feet on top of it likewise. To first order in s - 1 the
