@@ -102,8 +102,9 @@ def make_reference(
     """Completes a motion to a reference: table order, control rate, all joints and bodies.
 
     Joints that the motion lacks hold the default pose, those of hands, which the robot lacks, are dropped with a
-    warning; bodies that the motion lacks come from forward kinematics. The object's name and hinge, the scenery and the effectors are the task's. Linear velocities are differences of
-    positions: the simulator's are of the bodies' origins, those in files often of their centres of mass.
+    warning; bodies that the motion lacks come from forward kinematics. The object's name and hinge, the scenery and
+    the effectors are the task's. Linear velocities are differences of positions: the simulator's are of the bodies'
+    origins, those in files often of their centres of mass.
 
     Raises:
         MotionError: if the motion has joints or bodies that nothing knows, lacks the pelvis, the object, its

@@ -99,9 +99,12 @@ def reread(motion: Motion, given: Conventions) -> Motion:
     if given.angles == "degrees":
         motion = replace(motion, joint_pos=given.radians(motion.joint_pos), joint_vel=given.radians(motion.joint_vel))
     if given.unit is not None:
-        points = None if motion.contact_points is None else given.metres(motion.contact_points)
-        lengths = {key: given.metres(getattr(motion, key)) for key in ("body_pos_w", "body_lin_vel_w")}
-        motion = replace(motion, contact_points=points, **lengths)
+        motion = replace(
+            motion,
+            body_pos_w=given.metres(motion.body_pos_w),
+            body_lin_vel_w=given.metres(motion.body_lin_vel_w),
+            contact_points=None if motion.contact_points is None else given.metres(motion.contact_points),
+        )
     return motion
 
 
@@ -265,7 +268,7 @@ def _check_angles(where: object, field: str, motion: Motion) -> None:
     advice = "give angles=degrees, or angles=radians if it is meant as it is"
     other = "another robot's, or joints in another order; angles=radians takes it as it is"
     raise MotionError(
-        f"{where}: {field}: {names[j]} is at {angles[t, j]:.2f} rad at frame {t}, its range is {low:.2f} to {high:.2f}: "
+        f"{where}: {field}: {names[j]} is at {angles[t, j]:.2f} rad at frame {t}, beyond {low:.2f} to {high:.2f}: "
         + (f"in degrees all joints are within reach: {advice}" if fits else other)
     )
 

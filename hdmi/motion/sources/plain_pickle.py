@@ -44,7 +44,7 @@ def read_plain_pickle(path: str | Path) -> Any:
     path = files.existing_file(path)
     data = _unpacked(path, path.read_bytes())
     try:
-        return _Machine(path, data).run()
+        return _Machine(path, io.BytesIO(data), len(data)).run()
     except MotionError:
         raise
     except Exception as error:  # a damaged file raises what it likes
@@ -107,8 +107,8 @@ class _Array:
 class _Machine:
     """A stack and a memo, as the pickle language has them."""
 
-    def __init__(self, path: Path, data: bytes) -> None:
-        self.path, self.size, self.file = path, len(data), io.BytesIO(data)
+    def __init__(self, path: Path, file: io.BytesIO, size: int) -> None:
+        self.path, self.file, self.size = path, file, size
         self.stack: list[Any] = []
         self.memo: dict[int, Any] = {}
         self.made = 0  # bytes, about, of what calls made: a call is short, what it copies may be long
@@ -120,7 +120,7 @@ class _Machine:
         for module in ("builtins", "__builtin__"):
             self.calls |= {f"{module}.set": lambda items=(): set(self._keys(self._counted(items)))}
             self.calls |= {f"{module}.frozenset": lambda items=(): frozenset(self._keys(self._counted(items)))}
-            self.calls |= {f"{module}.bytearray": self._bytes}
+            self.calls |= {f"{module}.bytearray": self._bytes, f"{module}.bytes": self._bytes}
         for module in _NUMPY:
             self.calls |= {f"{module}multiarray._reconstruct": lambda *_: _Array()}
             self.calls |= {f"{module}multiarray.scalar": self._scalar}
@@ -355,10 +355,12 @@ class _Machine:
         dtype.order = "=" if order == "|" else order
 
     def _inline(self, state: dict[str, Any]) -> Any:
-        """What joblib wrote right behind the description of an array: padding, then the bytes."""
+        """What joblib wrote right behind the description of an array: padding, then the bytes; of objects a pickle."""
+        shape, dtype = state["shape"], state["dtype"]
+        if dtype.code[0] == "O":
+            return _Machine(self.path, self.file, self.size).run()
         if state.get("numpy_array_alignment_bytes") is not None:
             self.file.seek(self.file.read(1)[0], io.SEEK_CUR)
-        shape, dtype = state["shape"], state["dtype"]
         claimed = math.prod(shape) * dtype.numpy.itemsize
         return self._array(shape, dtype, self.file.read(min(claimed, self.size)), state.get("order") == "F")
 

@@ -111,10 +111,8 @@ def _read_table(path: Path) -> tuple[np.ndarray, list[str] | None]:
             raise MotionError(f"{path}: line {n}: {len(row)} columns, the line before has {len(rows[0])}")
         numbers = [_number(field, separator) for field in row]
         if None in numbers:
-            bad = row[numbers.index(None)]
-            raise MotionError(
-                f"{path}: not a table of numbers: line {n}, column {numbers.index(None) + 1}: {bad!r:.40}"
-            )
+            i = numbers.index(None)
+            raise MotionError(f"{path}: not a table of numbers: line {n}, column {i + 1}: {row[i]!r:.40}")
         rows.append([number for number in numbers if number is not None])
     if header is None:
         header = next((names for line in reversed(comments) if len(names := fields(line)) == len(rows[0])), None)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdmi.assets import g1
+from hdmi.assets import default_joint_pos, g1
 from hdmi.motion.check import MotionError, checked, checked_fps, checked_names
+from hdmi.motion.kinematics import forward_kinematics
 from hdmi.motion.motion import Motion
 from hdmi.motion.reference import is_finger_joint
 from hdmi.motion.sources.conventions import Conventions
@@ -26,6 +27,7 @@ _NAMES = ("dof_names", "joint_names")
 _AXES_ANGLES = "pose_aa"
 _NOT_NEEDED = ("local_body_pos", "link_body_list", "smpl_joints", "body_names", "contact_mask", "dof_vel")
 _OFF_AXIS = 0.02  # rad that a joint may turn about another axis than its own
+_MAX_FK_ERROR = 0.05  # m
 _SHOWN = 12
 
 
@@ -99,9 +101,9 @@ def read_robot_pickle(
         if joints is None and named is not None:
             joint_names = _joint_names(where, named, content[named], angles.shape[1])
         else:
-            if joints is None:
-                usual_layout = _by_axes(poses, angles.shape[1]) or usual_layout
-            joint_names = choose_layout(f"{where}: {angles_key}", angles, joints, usual_layout)
+            told = None if joints else _by_axes(poses, angles.shape[1]) or _by_bodies(where, content, angles)
+            known = LAYOUTS[told] if told else None
+            joint_names = known or choose_layout(f"{where}: {angles_key}", angles, joints, usual_layout)
     if lost := [joint for joint in joint_names if joint not in g1.JOINT_NAMES]:
         warnings.warn(f"{where}: joints of hands are dropped: {', '.join(lost)}", stacklevel=2)
     used = {position, rotation, angles_key, rate, *_NAMES, *_NOT_NEEDED, _AXES_ANGLES}
@@ -184,6 +186,38 @@ def _by_axes(poses: np.ndarray, count: int) -> str | None:
     fitting = [name for name, names in LAYOUTS.items() if len(names) == count and set(names) <= set(g1.JOINT_NAMES)]
     fitting = [name for name in fitting if _off_axis(poses, name) < _OFF_AXIS]
     return fitting[0] if len(fitting) == 1 else None
+
+
+def _by_bodies(where: str, content: dict[str, Any], angles: np.ndarray) -> str | None:
+    """The layout under which forward kinematics reproduces GMR's `local_body_pos`, where the file has it."""
+    names, local = content.get("link_body_list"), content.get("local_body_pos")
+    if not isinstance(names, list | tuple | np.ndarray) or not isinstance(local, np.ndarray):
+        return None
+    shared = [(i, g1.BODY_NAMES.index(name)) for i, name in enumerate(names) if name in g1.BODY_NAMES]
+    if local.shape != (len(angles), len(names), 3) or local.dtype.kind != "f" or len(shared) < 2:
+        return None
+    theirs, ours = zip(*shared, strict=True)
+    frames = np.linspace(0, len(angles) - 1, 10).astype(int)
+    origin, upright = np.zeros((len(frames), 3)), np.tile([1.0, 0.0, 0.0, 0.0], (len(frames), 1))
+    errors = {}
+    for layout, joints in LAYOUTS.items():
+        if len(joints) != angles.shape[1]:
+            continue
+        table = np.tile(default_joint_pos(), (len(frames), 1))
+        for i, joint in enumerate(joints):
+            if joint in g1.JOINT_NAMES:
+                table[:, g1.JOINT_NAMES.index(joint)] = angles[frames, i]
+        pos, _ = forward_kinematics(origin, upright, table)
+        apart = np.linalg.norm(pos[:, ours] - local[frames][:, theirs], axis=-1)
+        errors[layout] = float(np.nan_to_num(apart, nan=np.inf).mean())
+    best = min(errors, key=lambda layout: errors[layout], default=None)
+    if best is None or errors[best] < _MAX_FK_ERROR:
+        return best
+    warnings.warn(
+        f"{where}: local_body_pos is {errors[best]:.2f} m from the joints' forward kinematics: another robot's?",
+        stacklevel=3,
+    )
+    return None
 
 
 def _from_poses(where: str, poses: np.ndarray, joints: str | None) -> tuple[tuple[str, ...], np.ndarray]:
