@@ -221,7 +221,7 @@ def write_holosoma(motion: Motion, path: str | Path, object_name: str | None = N
 
 
 def robot_motion(
-    path: Path,
+    where: object,
     name: str,
     fps: float,
     root_pos: np.ndarray,
@@ -235,6 +235,7 @@ def robot_motion(
     """A motion of the robot alone: bodies from forward kinematics, velocities from differences.
 
     Args:
+        where: what messages start with: file, and clip if it holds several.
         root_pos, root_quat: float32, as the file has them. [T, 3] and [T, 4]
         joint_names, joint_pos: in any order, rad; what the robot lacks is dropped. [T, J]
         usual: order of quaternions in this format.
@@ -243,17 +244,17 @@ def robot_motion(
     Raises:
         MotionError: for quaternions that are not unit, or a robot that looks misread, see `settle`.
     """
-    quat = checked_quat(path, fields[1], given.wxyz(root_quat, usual)[:, None], ["root"], "body")[:, 0]
-    pos = checked(path, fields[0], given.metres(root_pos), root_pos.shape)
+    quat = checked_quat(where, fields[1], given.wxyz(root_quat, usual)[:, None], ["root"], "body")[:, 0]
+    pos = checked(where, fields[0], given.metres(root_pos), root_pos.shape)
     kept = [i for i, joint in enumerate(joint_names) if joint in g1.JOINT_NAMES]
     joint_names, joint_pos = tuple(joint_names[i] for i in kept), joint_pos[:, kept]
     table = np.tile(default_joint_pos(), (len(pos), 1))
     table[:, [g1.JOINT_NAMES.index(joint) for joint in joint_names]] = joint_pos
     body_pos, body_quat = forward_kinematics(pos, quat, table)
     body_pos[:, 0], body_quat[:, 0] = pos, quat
-    checked(path, fields[0], body_pos, body_pos.shape)
+    checked(where, fields[0], body_pos, body_pos.shape)
     motion = motion_from_poses(name, fps, g1.BODY_NAMES, joint_names, body_pos, body_quat, joint_pos)
-    return settle(motion, path, given, usual=usual, fields=fields)
+    return settle(motion, where, given, usual=usual, fields=fields)
 
 
 def _num_frames(path: Path, arrays: dict[str, np.ndarray], required: tuple[str, ...]) -> int:

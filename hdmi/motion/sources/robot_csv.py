@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +66,7 @@ def read_robot_csv(
     if len(columns.rotation) == 3:
         turn = Rotation.from_euler("xyz", given.radians(rotation))
         rotation, usual = turn.as_quat(scalar_first=True).astype(np.float32), "wxyz"
-        given = Conventions("wxyz", given.angles, given.unit, given.up, given.ground)
+        given = replace(given, quat="wxyz")
     return robot_motion(
         path, path.stem, fps, rows[:, columns.position], rotation, names, angles, given, usual, ("rows", where, "rows")
     )

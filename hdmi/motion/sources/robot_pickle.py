@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,50 +68,68 @@ def read_robot_pickle(
             f"{where}: needs {' or '.join(_POSITION)}, {' or '.join(_ROTATION)} and {' or '.join(_JOINTS)}; "
             f"it has {_listed(content)}"
         )
-    if rate is None and fps is None:
-        raise MotionError(f"{where}: does not say its rate ({', '.join(_RATE)}): give source_fps")
-    if rate is not None:
-        fps = float(_array(where, rate, content[rate]).reshape(-1)[:1].sum())
-    fps = checked_fps(where, fps if fps is not None else 0.0)
+    fps = _rate(where, fps, None if rate is None else _array(where, rate, content[rate]))
     pos = _array(where, position, content[position])
     num_frames = len(pos) if pos.ndim else 0
     if num_frames < 2:
         raise MotionError(f"{where}: {position}: needs at least 2 frames, has {num_frames}")
     pos = checked(where, position, pos, (num_frames, 3))
-    poses = np.zeros((num_frames, 0, 3))
-    if has_poses:
-        poses = _array(where, _AXES_ANGLES, content[_AXES_ANGLES])
-        if poses.size % (3 * num_frames) or not poses.size:
-            raise MotionError(f"{where}: {_AXES_ANGLES}: shape {poses.shape}, expected ({num_frames}, bodies, 3)")
-        poses = checked(where, _AXES_ANGLES, poses, poses.shape).reshape(num_frames, -1, 3)
+    poses = _poses(where, content, num_frames)
     if rotation is not None:
-        quat = checked(where, rotation, _array(where, rotation, content[rotation]), (num_frames, 4), " as " + position)
+        quat = checked(where, rotation, _array(where, rotation, content[rotation]), (num_frames, 4))
     else:
-        rotation = _AXES_ANGLES
+        rotation, given = _AXES_ANGLES, replace(given, quat="xyzw")
         quat = Rotation.from_rotvec(poses[:, 0]).as_quat().astype(np.float32)
-    usual_layout = "g1_29dof_anneal_23dof" if position != "root_pos" else None
     if angles_key is None:
         angles_key = _AXES_ANGLES
         joint_names, angles = _from_poses(where, poses, joints)
     else:
         angles = _array(where, angles_key, content[angles_key])
         angles = angles[..., 0] if angles.ndim == 3 and angles.shape[2] == 1 else angles
-        angles = checked(where, angles_key, angles, (num_frames, *angles.shape[1:2]), " as " + position)
-        angles = given.radians(angles)
-        named = next((key for key in _NAMES if isinstance(content.get(key), list | tuple | np.ndarray)), None)
-        if joints is None and named is not None:
-            joint_names = _joint_names(where, named, content[named], angles.shape[1])
-        else:
-            told = None if joints else _by_axes(poses, angles.shape[1]) or _by_bodies(where, content, angles)
-            known = LAYOUTS[told] if told else None
-            joint_names = known or choose_layout(f"{where}: {angles_key}", angles, joints, usual_layout)
+        angles = given.radians(checked(where, angles_key, angles, (num_frames, *angles.shape[1:2])))
+        usual = "g1_29dof_anneal_23dof" if position != _POSITION[0] else None
+        joint_names = _joints(f"{where}: {angles_key}", content, angles, poses, joints, usual)
     if lost := [joint for joint in joint_names if joint not in g1.JOINT_NAMES]:
         warnings.warn(f"{where}: joints of hands are dropped: {', '.join(lost)}", stacklevel=2)
     used = {position, rotation, angles_key, rate, *_NAMES, *_NOT_NEEDED, _AXES_ANGLES}
     if unused := [str(key) for key, value in content.items() if key not in used and value is not None]:
-        warnings.warn(f"{where}: not read: {', '.join(unused)}", stacklevel=2)
+        warnings.warn(f"{where}: not read: {_listed(unused)}", stacklevel=2)
     fields = (position, rotation, angles_key)
-    return robot_motion(Path(where), name, fps, pos, quat, joint_names, angles, given, "xyzw", fields)
+    return robot_motion(where, name, fps, pos, quat, joint_names, angles, given, "xyzw", fields)
+
+
+def _rate(where: str, given: float | None, own: np.ndarray | None) -> float:
+    if own is None:
+        if given is None:
+            raise MotionError(f"{where}: does not say its rate ({', '.join(_RATE)}): give source_fps")
+        return checked_fps(where, given)
+    if own.size != 1:
+        raise MotionError(f"{where}: fps: a number expected, got shape {own.shape}")
+    fps = checked_fps(where, float(own.reshape(-1)[0]))
+    if given is not None and abs(given - fps) > 1e-3:
+        warnings.warn(f"{where}: says its rate itself, {fps:g} fps: source_fps={given:g} is not used", stacklevel=3)
+    return fps
+
+
+def _poses(where: str, content: dict[str, Any], num_frames: int) -> np.ndarray:
+    """`pose_aa`: rotation vectors of root, joints and links that are no joints. [T, B, 3], no B if there is none"""
+    if content.get(_AXES_ANGLES) is None:
+        return np.zeros((num_frames, 0, 3))
+    poses = _array(where, _AXES_ANGLES, content[_AXES_ANGLES])
+    if not poses.size or poses.size % (3 * num_frames) or len(poses) not in (1, num_frames):
+        raise MotionError(f"{where}: {_AXES_ANGLES}: shape {poses.shape}, expected ({num_frames}, bodies, 3)")
+    return checked(where, _AXES_ANGLES, poses, poses.shape).reshape(num_frames, -1, 3)
+
+
+def _joints(
+    where: str, content: dict[str, Any], angles: np.ndarray, poses: np.ndarray, given: str | None, usual: str | None
+) -> tuple[str, ...]:
+    """Names of the joints: those that the file has, else those that it shows, else the usual ones."""
+    named = next((key for key in _NAMES if isinstance(content.get(key), list | tuple | np.ndarray)), None)
+    if given is None and named is not None:
+        return _joint_names(where, named, content[named], angles.shape[1])
+    shown = None if given else _by_axes(poses, angles.shape[1]) or _by_bodies(where, content, angles)
+    return LAYOUTS[shown] if shown else choose_layout(where, angles, given, usual)
 
 
 def _chosen(path: Path, content: object, clip: str | None) -> tuple[str, str, dict[str, Any]]:
