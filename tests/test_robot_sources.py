@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import json
 import os
@@ -9,6 +10,7 @@ import pickle
 import sys
 import types
 import warnings
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +27,8 @@ from hdmi.motion.motion import motion_from_poses
 from hdmi.motion.reference import is_finger_joint
 from hdmi.motion.sources import (
     Conventions,
+    convert,
+    guess_format,
     read_holosoma,
     read_mjlab,
     read_robot_csv,
@@ -32,6 +36,7 @@ from hdmi.motion.sources import (
     write_holosoma,
     write_robot_csv,
 )
+from hdmi.motion.sources.formats import Options
 from hdmi.motion.sources.layouts import LAYOUTS
 from hdmi.motion.sources.plain_pickle import read_plain_pickle
 
@@ -43,7 +48,6 @@ FINGERS = [
     for side in ("left", "right")
     for finger in ("thumb_0", "thumb_1", "thumb_2", "middle_0", "middle_1", "index_0", "index_1")
 ]
-LIES = Rotation.from_euler("y", -90, degrees=True)
 pytestmark = pytest.mark.filterwarnings("ignore:.*does not say its rate:UserWarning")
 
 
@@ -120,7 +124,7 @@ class TestOrderOfQuaternions:
     @pytest.mark.parametrize("axis", ["x", "y"])
     @pytest.mark.parametrize("heading", [0, 90, 180])
     def test_a_robot_that_lies_on_the_ground_lies(self, tmp_path: Path, axis: str, heading: float) -> None:
-        pos, quat = pose(heading, Rotation.from_euler(axis, -90, degrees=True), height=0.12)
+        pos, quat = pose(heading, Rotation.from_euler(axis, -90, degrees=True), height={"x": 0.34, "y": 0.1}[axis])
         motion = read_robot_csv(write_csv(tmp_path / "a.csv", table(pos, quat, angles())))
         np.testing.assert_allclose(motion.body_quat_w[:, 0], quat, atol=1e-6)
 
@@ -282,9 +286,6 @@ class TestGround:
 
     def test_a_motion_folder_is_taken_as_it_is(self, tmp_path: Path) -> None:
         """Its scene may have something to stand on."""
-        from hdmi.motion.sources import convert
-        from hdmi.motion.sources.formats import Options
-
         raised = walking().body_pos_w + np.float32([0, 0, 0.9])
         folder = save_motion(replace(walking(), body_pos_w=raised), tmp_path / "walk")
         with warnings.catch_warnings():
@@ -399,8 +400,8 @@ class TestTables:
     @pytest.mark.parametrize(
         ("change", "fragment"),
         [
-            (lambda names: names[:-1] + ["right_wrist_yow_joint"], "right_wrist_yow_joint"),
-            (lambda names: names[:-1] + [names[-2]], "right_wrist_pitch_joint twice"),
+            (lambda names: [*names[:-1], "right_wrist_yow_joint"], "right_wrist_yow_joint"),
+            (lambda names: [*names[:-1], names[-2]], "right_wrist_pitch_joint twice"),
             (lambda names: names[:-1], "names 35 columns, the rows have 36"),
             (lambda names: ["tail_joint", *names[1:7], *names[7:]], "tail_joint"),
         ],
@@ -545,8 +546,12 @@ class TestHands:
     def test_a_misspelt_joint_is_no_finger(self, tmp_path: Path) -> None:
         motion = self.motion()
         names = tuple(name.replace("left_wrist_roll", "left_wrist_rol") for name in motion.joint_names)
-        with pytest.raises(MotionError, match=r"joint_names: \['left_wrist_rol_joint'\]"), pytest.warns(UserWarning):
-            make_reference(replace(motion, joint_names=names), control_dt=0.02)
+        motion = replace(motion, joint_names=names)
+        with (
+            pytest.warns(UserWarning, match="joints of hands"),
+            pytest.raises(MotionError, match=r"joint_names: \['left_wrist_rol_joint'\]"),
+        ):
+            make_reference(motion, control_dt=0.02)
 
     @pytest.mark.parametrize("source", ["hdmi", "csv", "named csv", "holosoma", "pickle"])
     def test_convert_drops_them_with_a_note(
@@ -757,17 +762,14 @@ class TestPickles:
 
     @pytest.mark.parametrize("suffix", [".pickle", ".p", ".joblib", ".PKL"])
     def test_is_found_by_its_suffix_and_only_read(self, tmp_path: Path, suffix: str) -> None:
-        from hdmi.motion.sources import convert, guess_format
-
         path = tmp_path / f"a{suffix}"
         path.write_bytes(pickle.dumps(gmr(walking())))
         assert guess_format(path) == "pickle"
         with pytest.raises(MotionError, match="'pickle' is only read; written are hdmi, "):
             convert(path, tmp_path / "b.pkl", "pickle")
+        folder, options = save_motion(walking(), tmp_path / "walk"), Options(clip="a")
         with pytest.raises(MotionError, match="hdmi takes no clip"):
-            from hdmi.motion.sources.formats import Options
-
-            convert(save_motion(walking(), tmp_path / "w"), tmp_path / "c", "hdmi", options=Options(clip="a"))
+            convert(folder, tmp_path / "c", "hdmi", options=options)
 
     def test_a_rate_that_is_missing(self, tmp_path: Path) -> None:
         content = gmr(walking())
@@ -867,19 +869,16 @@ class TestPicklesAreData:
         assert read.keys() == content.keys()
         for key, value in content.items():
             for ours, theirs in zip(read[key], value, strict=True) if isinstance(value, list) else [(read[key], value)]:
-                np.testing.assert_array_equal(ours, theirs, err_msg=str(key))
-                assert getattr(ours, "dtype", None) == getattr(theirs, "dtype", None) or np.isscalar(theirs)
+                if isinstance(theirs, np.ndarray):
+                    assert ours.dtype == theirs.dtype
+                    np.testing.assert_array_equal(ours, theirs)
+                else:
+                    assert ours == theirs
 
-    @pytest.mark.parametrize(
-        "unpacked",
-        [
-            lambda d: __import__("zlib").compress(d),
-            *(lambda d, m=m: __import__(m).compress(d) for m in ("gzip", "bz2", "lzma")),
-        ],
-    )
-    def test_compressed_joblib(self, tmp_path: Path, unpacked: Callable, joblib_bytes: Callable[[Any], bytes]) -> None:
+    @pytest.mark.parametrize("compressor", ["zlib", "gzip", "bz2", "lzma"])
+    def test_compressed_joblib(self, tmp_path: Path, compressor: str, joblib_bytes: Callable[[Any], bytes]) -> None:
         content = {"a": np.asfortranarray(np.arange(6.0).reshape(2, 3)), "b": [np.arange(3), "x"]}
-        (tmp_path / "a.pkl").write_bytes(unpacked(joblib_bytes(content)))
+        (tmp_path / "a.pkl").write_bytes(importlib.import_module(compressor).compress(joblib_bytes(content)))
         read = read_plain_pickle(tmp_path / "a.pkl")
         np.testing.assert_array_equal(read["a"], content["a"])
         np.testing.assert_array_equal(read["b"][0], [0, 1, 2])
@@ -890,18 +889,18 @@ class TestPicklesAreData:
         ("function", "arguments", "name"),
         [
             (os.system, ("touch ran",), "posix.system|nt.system"),
-            (eval, ("open('ran', 'w')",), "builtin.*eval"),
-            (exec, ("open('ran', 'w')",), "builtin.*exec"),
-            (getattr, (np, "load"), "builtin.*getattr"),
-            (open, ("ran", "w"), "open"),
+            (eval, ("open('ran', 'w')",), ".*builtin.*eval"),
+            (exec, ("open('ran', 'w')",), ".*builtin.*exec"),
+            (getattr, ("", "join"), ".*builtin.*getattr"),
+            (open, ("ran", "w"), ".*open"),
             (np.load, ("ran.npy",), "numpy.*load"),
             (np.fromfile, ("ran",), "numpy.*fromfile"),
             (np.save, ("ran", 1), "numpy.*save"),
             (np.memmap, ("ran",), "numpy.*memmap"),
             (np.zeros, (10**12,), "numpy.*zeros"),
             (bytearray, (10**12,), "bytes of a int"),
-            (range, (10**12,), "builtin.*range"),
-            (Plain, (), "Plain"),
+            (range, (10**12,), ".*builtin.*range"),
+            (Plain, (), ".*Plain"),
         ],
     )
     def test_calls_are_refused_by_name(
@@ -972,8 +971,6 @@ class TestPicklesAreData:
                     read_plain_pickle(tmp_path / "a.pkl")
 
     def test_bombs(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        import zlib
-
         monkeypatch.setattr("hdmi.motion.files.MAX_BYTES", 1_000_000)
         (tmp_path / "a.pkl").write_bytes(zlib.compress(pickle.dumps(np.zeros(10**6))))
         with pytest.raises(MotionError, match="unpacks to more than"):
@@ -998,7 +995,7 @@ class TestPicklesAreData:
 
     def test_structured_arrays_are_refused(self, tmp_path: Path) -> None:
         (tmp_path / "a.pkl").write_bytes(pickle.dumps(np.zeros(3, dtype=[("a", "f4"), ("b", "i4")])))
-        with pytest.raises(MotionError, match="wants .* dtype"):
+        with pytest.raises(MotionError, match=r"wants .* dtype"):
             read_plain_pickle(tmp_path / "a.pkl")
 
 
@@ -1013,7 +1010,7 @@ def test_holosoma_that_lies_is_refused_and_believed(tmp_path: Path) -> None:
         body_quat_w=quat.reshape(T, -1, 4).astype(np.float32),
     )
     path, _ = write_holosoma(moved, tmp_path / "a.npz")
-    with pytest.raises(MotionError, match="body_quat_w: the robot lies .* up=y"):
+    with pytest.raises(MotionError, match=r"body_quat_w: the robot lies .* up=y"):
         read_holosoma(path)
     taken = read_holosoma(path, given=Conventions(up="y"))
     np.testing.assert_allclose(taken.body_pos_w[..., 2], motion.body_pos_w[..., 2], atol=1e-5)

@@ -143,9 +143,8 @@ def convert(
         raise MotionError(f"{source}: no such file or folder")
     write, suffix = FORMATS[to].write, FORMATS[to].suffix
     if write is None:
-        raise MotionError(
-            f"{to} is only read; written are {', '.join(name for name in FORMATS if FORMATS[name].write)}"
-        )
+        written = ", ".join(name for name in FORMATS if FORMATS[name].write)
+        raise MotionError(f"the format {to!r} is only read; written are {written}")
     if out.suffix != suffix and suffix:
         raise MotionError(f"{out}: a motion in the format {to!r} ends in {suffix}")
     source_format = source_format or guess_format(source)
