@@ -128,6 +128,14 @@ class TestOrderOfQuaternions:
         motion = read_robot_csv(write_csv(tmp_path / "a.csv", table(pos, quat, angles())))
         np.testing.assert_allclose(motion.body_quat_w[:, 0], quat, atol=1e-6)
 
+    @pytest.mark.parametrize("axis", ["x", "y"])
+    def test_a_robot_in_a_motion_folder_may_lie_on_something(self, tmp_path: Path, axis: str) -> None:
+        pos, quat = pose(20, Rotation.from_euler(axis, -90, degrees=True), height=0.8)
+        body_pos, body_quat = forward_kinematics(pos, quat, angles())
+        motion = motion_from_poses("bed", 50.0, g1.BODY_NAMES, g1.JOINT_NAMES, body_pos, body_quat, angles())
+        taken, _, _ = convert(save_motion(motion, tmp_path / "bed"), tmp_path / "same", "hdmi")
+        np.testing.assert_array_equal(taken.body_quat_w, motion.body_quat_w)
+
     @pytest.mark.parametrize("writer", ["mjlab", "holosoma", "hdmi", "pickle"])
     def test_in_every_format(self, tmp_path: Path, writer: str, capsys: pytest.CaptureFixture[str]) -> None:
         from convert import main

@@ -138,7 +138,7 @@ def settle(
     points, radii = _surface(motion, frames)
     pos, quat = motion.body_pos_w[frames, root].astype(float), motion.body_quat_w[frames, root].astype(float)
     readings = _readings(given, usual, pos, quat, points, radii)
-    _check_upright(f"{where}: {fields[1]}", readings, given)
+    _check_upright(f"{where}: {fields[1]}", readings, given, has_scenery)
     if given.up not in (None, "z"):
         motion = _turned(motion, _TO_Z[given.up])
     if given.ground == "shift":
@@ -203,7 +203,7 @@ def _forward(pos: np.ndarray, turn: Rotation) -> float:
     return float((steps * turn.as_matrix()[:-1, :2, 0]).sum() / length)
 
 
-def _check_upright(where: str, readings: Sequence[_Reading], given: Conventions) -> None:
+def _check_upright(where: str, readings: Sequence[_Reading], given: Conventions, has_scenery: bool) -> None:
     own, *others = readings
     better = []
     for other in others:
@@ -212,7 +212,9 @@ def _check_upright(where: str, readings: Sequence[_Reading], given: Conventions)
         if other.options.keys() == {"quat"}:
             fits = True
         else:
-            fits = own.leans > _LEANS and (given.quat is None or other.on_ground >= 0.5 > own.on_ground)
+            # where the robot may lie on something, or the order of quaternions is sure, the ground has to tell
+            sure = has_scenery or given.quat is not None
+            fits = own.leans > _LEANS and (not sure or other.on_ground >= 0.5 > own.on_ground)
         # a robot that lies does so on the ground
         if fits and (own.on_ground < 0.5 or other.on_ground > own.on_ground - 0.2):
             better.append(other)
