@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -171,4 +172,19 @@ def write_bvh(path: Path, *, t_pose: bool = False) -> Path:
         rows[2, 9] = 90
     lines = "\n".join(" ".join(f"{value:.1f}" for value in row) for row in rows)
     path.write_text(f"HIERARCHY\n{hips}\nMOTION\nFrames: 3\nFrame Time: 0.033333\n{lines}\n")
+    return path
+
+
+def write_gmr(path: Path) -> Path:
+    """A robot that walks and turns, as GMR pickles it."""
+    arrays = robot_arrays()
+    content = {
+        "fps": 30.0,
+        "root_pos": arrays["body_pos_w"][:, 0],
+        "root_rot": np.roll(arrays["body_quat_w"][:, 0], -1, axis=-1),
+        "dof_pos": arrays["joint_pos"],
+        "local_body_pos": None,
+        "link_body_list": None,
+    }
+    path.write_bytes(pickle.dumps(content))
     return path

@@ -15,7 +15,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sources import robot_arrays, write_amass, write_bvh, write_gvhmr, write_intermimic, write_omomo
+from sources import robot_arrays, write_amass, write_bvh, write_gmr, write_gvhmr, write_intermimic, write_omomo
 
 import hdmi.motion.sources as readers
 from hdmi.assets import g1
@@ -43,6 +43,7 @@ READERS: dict[str, tuple[str, Write, Read]] = {
     "mjlab": ("a.npz", lambda path: readers.write_mjlab(_motion(), path), readers.read_mjlab),
     "holosoma": ("a.npz", lambda path: readers.write_holosoma(_motion(), path), readers.read_holosoma),
     "csv": ("a.csv", lambda path: readers.write_robot_csv(_motion(), path), readers.read_robot_csv),
+    "pickle": ("a.pkl", write_gmr, readers.read_robot_pickle),
     "hdmi": ("motion.npz", lambda path: save_motion(_motion(), path.parent), lambda path: load_motion(path.parent)),
 }
 every_reader = pytest.mark.parametrize("name", READERS)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -12,6 +14,7 @@ import torch
 from torch import Tensor
 
 from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig, g1
+from hdmi.motion.check import checked_fps
 from hdmi.motion.kinematics import (
     angular_velocity,
     derivative,
@@ -24,6 +27,11 @@ from hdmi.motion.kinematics import (
 from hdmi.motion.motion import Motion, MotionError, load_motion
 
 _ROOT_JOINT = "root"  # a column that some tools write for the free joint; nothing reads it
+_FINGERS = r"thumb|finger|index|middle|ring|pinky|little"
+_FINGER_JOINT = re.compile(
+    rf"(.*_)?(left|right|l|r)_(.*_)?(hand|gripper|claw|palm|{_FINGERS})(_?\d+)?(_.*)?|({_FINGERS})_?\d+(_.*)?"
+    r"|(left|right)_(zero|one|two|three|four|five|six)_joint"
+)
 _EMBEDDED = Path(__file__).parent / "references"
 
 
@@ -95,9 +103,10 @@ def make_reference(
     """Completes a motion to a reference: table order, control rate, all joints and bodies.
 
     Joints that the motion lacks hold the robot's default pose, and so do those that the robot holds there whatever a
-    motion says; bodies that it lacks, or that these joints move, come from forward kinematics. The object's name and
-    hinge, the scenery and the effectors are the task's. Linear velocities are differences of positions: the
-    simulator's are of the bodies' origins, those in files often of their centres of mass.
+    motion says; those of hands, which the robot lacks, are dropped with a warning. Bodies that the motion lacks, or
+    that held joints move, come from forward kinematics. The object's name and hinge, the scenery and the effectors are
+    the task's. Linear velocities are differences of positions: the simulator's are of the bodies' origins, those in
+    files often of their centres of mass.
 
     Raises:
         MotionError: if the motion has joints or bodies that nothing knows, lacks the pelvis, the object, its
@@ -106,6 +115,7 @@ def make_reference(
     motion = motion if isinstance(motion, Motion) else load_motion(motion)
     where = f"motion {motion.name!r}"
     hinge = object.hinge.name if object is not None and object.hinge is not None else None
+    motion = without_fingers(motion, keep=hinge)
     unknown = [name for name in motion.joint_names if name not in (*g1.JOINT_NAMES, _ROOT_JOINT, hinge)]
     if unknown:
         raise MotionError(f"{where}: joint_names: {unknown} are neither the robot's nor the object's hinge ({hinge!r})")
@@ -159,6 +169,25 @@ def make_reference(
         contact_point=tensor(points),
         placements=placements,
     )
+
+
+def is_finger_joint(name: str) -> bool:
+    """Whether a joint is called as those of hands are that the robot lacks, such as `left_hand_thumb_0_joint`."""
+    plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
+    return name not in g1.JOINT_NAMES and _FINGER_JOINT.fullmatch(plain) is not None
+
+
+def without_fingers(motion: Motion, keep: str | None = None) -> Motion:
+    """The motion without joints of hands, which the robot lacks; warns if there are any.
+
+    Args:
+        keep: a joint that stays, whatever it is called: the object's hinge.
+    """
+    fingers = [name for name in motion.joint_names if name != keep and is_finger_joint(name)]
+    if not fingers:
+        return motion
+    warnings.warn(f"motion {motion.name!r}: joints of hands are dropped: {', '.join(fingers)}", stacklevel=3)
+    return motion.with_joints([name for name in motion.joint_names if name not in fingers])
 
 
 def complete_robot(motion: Motion, robot: RobotConfig | None = None) -> Motion:
@@ -248,10 +277,20 @@ def _contacts(motion: Motion, effectors: Sequence[Effector]) -> tuple[np.ndarray
 
 
 def resample(motion: Motion, fps: float) -> Motion:
-    """The motion at another rate: positions and velocities linear, orientations slerp, labels nearest."""
+    """The motion at another rate: positions and velocities linear, orientations slerp, labels nearest.
+
+    Raises:
+        MotionError: unless the rate is from 1 to 1000 frames per second, and leaves at least 2 frames.
+    """
     if abs(motion.fps - fps) < 1e-6:
         return motion
-    old, new = resampled_times(motion.num_frames, motion.fps, fps)
+    where = f"motion {motion.name!r}"
+    old, new = resampled_times(motion.num_frames, motion.fps, checked_fps(where, fps))
+    if len(new) < 2:
+        raise MotionError(
+            f"{where}: its {motion.num_frames} frames at {motion.fps:g} fps are 1 frame at {fps:g} fps, and a motion "
+            "needs at least 2"
+        )
     nearest = nearest_frames(old, new)
     sampled: dict[str, Any] = {
         key: interpolate(getattr(motion, key), old, new)

@@ -1,26 +1,23 @@
 """Readers of other people's motions: of persons into `HumanMotion`, of robots into `Motion` and back.
 
-Files are data, never programs: pickles are refused, damaged files end in a MotionError that names file, field and
-frame.
+Files are data, never programs: nothing is unpickled (`plain_pickle` reads those of robot motions without running
+them), damaged files end in a MotionError that names file, field and frame.
 """
 
 from hdmi.motion.sources.bvh import read_bvh
+from hdmi.motion.sources.conventions import Conventions
 from hdmi.motion.sources.formats import FORMATS, convert, guess_format
 from hdmi.motion.sources.interaction import read_intermimic, read_omomo
 from hdmi.motion.sources.person import PERSON_FORMATS, read_person
-from hdmi.motion.sources.robot import (
-    read_holosoma,
-    read_mjlab,
-    read_robot_csv,
-    write_holosoma,
-    write_mjlab,
-    write_robot_csv,
-)
+from hdmi.motion.sources.robot import read_holosoma, read_mjlab, write_holosoma, write_mjlab
+from hdmi.motion.sources.robot_csv import read_robot_csv, write_robot_csv
+from hdmi.motion.sources.robot_pickle import read_robot_pickle
 from hdmi.motion.sources.smpl import read_amass, read_gvhmr
 
 __all__ = [
     "FORMATS",
     "PERSON_FORMATS",
+    "Conventions",
     "convert",
     "guess_format",
     "read_amass",
@@ -32,6 +29,7 @@ __all__ = [
     "read_omomo",
     "read_person",
     "read_robot_csv",
+    "read_robot_pickle",
     "write_holosoma",
     "write_mjlab",
     "write_robot_csv",

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from hdmi.motion.check import MotionError
 from hdmi.motion.files import read_npz
 from hdmi.motion.motion import Motion, load_motion, save_motion
-from hdmi.motion.reference import resample
-from hdmi.motion.sources.robot import (
-    read_holosoma,
-    read_mjlab,
-    read_robot_csv,
-    write_holosoma,
-    write_mjlab,
-    write_robot_csv,
-)
+from hdmi.motion.reference import resample, without_fingers
+from hdmi.motion.sources.conventions import Conventions, reread, settle
+from hdmi.motion.sources.robot import read_holosoma, read_mjlab, write_holosoma, write_mjlab
+from hdmi.motion.sources.robot_csv import read_robot_csv, write_robot_csv
+from hdmi.motion.sources.robot_pickle import read_robot_pickle
+
+_PICKLES = (".pkl", ".pickle", ".p", ".joblib")
 
 
 @dataclass(frozen=True)
@@ -25,12 +23,18 @@ class Options:
     """What a file does not say.
 
     Args:
-        fps: of a CSV.
+        fps: of a CSV, or of a pickle that does not say.
         object_name: of the object of a holosoma motion.
+        clip: of a pickle that holds several.
+        joints: of a CSV or pickle that does not name them, a name in `hdmi.motion.sources.layouts.LAYOUTS`.
+        given: how the file means its numbers.
     """
 
-    fps: float = 30.0
+    fps: float | None = None
     object_name: str | None = None
+    clip: str | None = None
+    joints: str | None = None
+    given: Conventions = field(default_factory=Conventions)
 
 
 @dataclass(frozen=True)
@@ -39,34 +43,49 @@ class Format:
 
     suffix: str  # empty: a folder
     read: Callable[[Path, Options], Motion]
-    write: Callable[[Motion, Path, Options], tuple[Path, list[str]]]
+    write: Callable[[Motion, Path, Options], tuple[Path, list[str]]] | None  # None: is only read
+    takes: tuple[str, ...] = ()  # of the options
+
+
+def _read_hdmi(path: Path, options: Options) -> Motion:
+    motion = reread(load_motion(path), options.given)
+    return settle(motion, path / "motion.npz", options.given, has_scenery=True)
 
 
 FORMATS = {
     "hdmi": Format(
         "",
-        lambda path, options: load_motion(path),
+        _read_hdmi,
         lambda motion, path, options: (save_motion(motion, path), []),
     ),
     "mjlab": Format(
         ".npz",
-        lambda path, options: read_mjlab(path),
+        lambda path, options: read_mjlab(path, given=options.given),
         lambda motion, path, options: write_mjlab(motion, path, "mujoco"),
     ),
     "beyondmimic": Format(
         ".npz",
-        lambda path, options: read_mjlab(path),
+        lambda path, options: read_mjlab(path, given=options.given),
         lambda motion, path, options: write_mjlab(motion, path, "isaac"),
     ),
     "holosoma": Format(
         ".npz",
-        lambda path, options: read_holosoma(path, options.object_name),
+        lambda path, options: read_holosoma(path, options.object_name, options.given),
         lambda motion, path, options: write_holosoma(motion, path, options.object_name),
     ),
     "csv": Format(
         ".csv",
-        lambda path, options: read_robot_csv(path, options.fps),
+        lambda path, options: read_robot_csv(path, options.fps, joints=options.joints, given=options.given),
         lambda motion, path, options: write_robot_csv(motion, path),
+        ("joints",),
+    ),
+    "pickle": Format(
+        ".pkl",
+        lambda path, options: read_robot_pickle(
+            path, options.fps, clip=options.clip, joints=options.joints, given=options.given
+        ),
+        None,
+        ("clip", "joints"),
     ),
 }
 
@@ -80,12 +99,16 @@ def guess_format(path: str | Path) -> str:
     path = Path(path)
     if path.is_dir():
         return "hdmi"
-    if path.suffix == ".csv":
+    suffix = path.suffix.lower()
+    if suffix in (".csv", ".tsv"):
         return "csv"
-    if path.suffix == ".npz":
+    if suffix in _PICKLES:
+        return "pickle"
+    if suffix == ".npz":
         return "holosoma" if read_npz(path, {"joint_names"}) else "mjlab"
     raise MotionError(
-        f"{path}: neither a motion folder nor an .npz or .csv; the formats of robot motions are {', '.join(FORMATS)}"
+        f"{path}: neither a motion folder nor an .npz or .csv, nor a .pkl; the formats of robot motions are "
+        f"{', '.join(FORMATS)}"
     )
 
 
@@ -107,7 +130,9 @@ def convert(
         The motion, the path that was written, and what of the motion the format cannot hold.
 
     Raises:
-        MotionError: if the source cannot be read, or a format is unknown.
+        MotionError: if the source cannot be read, a format is unknown or only read, or does not take an option.
+
+    Joints of hands, which the robot lacks, are dropped; warnings say what was assumed and what was left out.
     """
     options = options or Options()
     for name in (to, source_format):
@@ -116,10 +141,17 @@ def convert(
     source, out = Path(source), Path(out)
     if not source.exists():
         raise MotionError(f"{source}: no such file or folder")
-    suffix = FORMATS[to].suffix
+    write, suffix = FORMATS[to].write, FORMATS[to].suffix
+    if write is None:
+        written = ", ".join(name for name in FORMATS if FORMATS[name].write)
+        raise MotionError(f"the format {to!r} is only read; written are {written}")
     if out.suffix != suffix and suffix:
         raise MotionError(f"{out}: a motion in the format {to!r} ends in {suffix}")
-    motion = FORMATS[source_format or guess_format(source)].read(source, options)
+    source_format = source_format or guess_format(source)
+    for key in ("clip", "joints"):
+        if getattr(options, key) is not None and key not in FORMATS[source_format].takes:
+            raise MotionError(f"{source}: {source_format} takes no {key}")
+    motion = without_fingers(FORMATS[source_format].read(source, options))
     motion = motion if fps is None else resample(motion, fps)
-    path, lost = FORMATS[to].write(motion, out, options)
+    path, lost = write(motion, out, options)
     return motion, path, lost

@@ -1,28 +1,31 @@
-"""References of the same robot in other projects' formats: mjlab and BeyondMimic, holosoma, and plain CSV."""
+"""References of the same robot in other projects' npz formats: mjlab and BeyondMimic, holosoma."""
 
 from __future__ import annotations
 
-import warnings
-from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdmi.assets import g1
+from hdmi.assets import default_joint_pos, g1
 from hdmi.motion.check import MotionError, checked, checked_fps, checked_names, checked_quat
-from hdmi.motion.files import read_npz, read_text, write_npz, write_text
-from hdmi.motion.kinematics import angular_velocity, derivative, forward_kinematics
-from hdmi.motion.motion import Motion
+from hdmi.motion.files import read_npz, write_npz
+from hdmi.motion.kinematics import forward_kinematics
+from hdmi.motion.motion import Motion, motion_from_poses
 from hdmi.motion.reference import complete_robot
+from hdmi.motion.sources.conventions import Conventions, reread, settle
+from hdmi.motion.sources.layouts import breadth_first
 
 Order = Literal["mujoco", "isaac"]
 
 _BODY_KEYS = {"body_pos_w": 3, "body_quat_w": 4, "body_lin_vel_w": 3, "body_ang_vel_w": 3}
 _OBJECT_KEYS = {"object_pos_w": 3, "object_quat_w": 4, "object_lin_vel_w": 3, "object_ang_vel_w": 3}
 _MAX_FK_ERROR = 0.05  # m; more is another robot, or another order
-_COLUMNS = 7 + len(g1.JOINT_NAMES)
+_FOREIGN = "not this robot's"
 
 
 # -- mjlab, BeyondMimic ---------------------------------------------------------------------------------------
@@ -33,30 +36,24 @@ def table_order(order: Order) -> tuple[list[int], list[int]]:
 
     MuJoCo counts depth first, as the robot table does, Isaac Lab breadth first.
     """
-    joints, bodies = list(range(len(g1.JOINT_NAMES))), list(range(len(g1.BODY_NAMES)))
-    if order == "mujoco":
-        return joints, bodies
-    bodies, queue = [], deque(["pelvis"])
-    while queue:
-        name = queue.popleft()
-        bodies.append(g1.BODY_NAMES.index(name))
-        queue.extend(body.name for body in g1.BODIES if body.parent == name)
-    moved_by = {joint.body: j for j, joint in enumerate(g1.JOINTS)}
-    return [moved_by[g1.BODY_NAMES[b]] for b in bodies if g1.BODY_NAMES[b] in moved_by], bodies
+    if order == "isaac":
+        return breadth_first()
+    return list(range(len(g1.JOINT_NAMES))), list(range(len(g1.BODY_NAMES)))
 
 
-def read_mjlab(path: str | Path, order: Order | None = None) -> Motion:
+def read_mjlab(path: str | Path, order: Order | None = None, given: Conventions | None = None) -> Motion:
     """A motion of mjlab or BeyondMimic (whole_body_tracking): an npz of the robot's 29 joints and 30 bodies.
 
     The file names neither: its order is mjlab's (MuJoCo, depth first) or BeyondMimic's (Isaac Lab, breadth first).
 
     Args:
         order: of joints and bodies; None takes the one in which forward kinematics reproduces the bodies.
+        given: how the file means its numbers.
 
     Raises:
-        MotionError: if the file is not such a motion, or is one of another robot.
+        MotionError: if the file is not such a motion, is one of another robot, or looks misread, see `settle`.
     """
-    path = Path(path)
+    path, given = Path(path), given or Conventions()
     arrays = read_npz(path, {"fps", "joint_pos", "joint_vel", *_BODY_KEYS})
     num_frames = _num_frames(path, arrays, ("fps", "joint_pos", "joint_vel", *_BODY_KEYS))
     fps = _fps(path, arrays["fps"])
@@ -68,27 +65,39 @@ def read_mjlab(path: str | Path, order: Order | None = None) -> Motion:
         values[key] = checked(path, key, arrays[key], (num_frames, len(g1.BODY_NAMES), width), because)
     values["body_quat_w"] = checked_quat(path, "body_quat_w", values["body_quat_w"], g1.BODY_NAMES, "row of")
     orders: tuple[Order, ...] = ("mujoco", "isaac") if order is None else (order,)
-    candidates = [_in_table_order(values, o) for o in orders]
+    motions = [_in_table_order(path.stem, fps, values, o) for o in orders]
+    candidates = [reread(motion, given) for motion in motions]
     errors = [_kinematic_error(candidate) for candidate in candidates]
     best = int(np.argmin(errors))
     if errors[best] > _MAX_FK_ERROR:
         raise MotionError(
             f"{path}: body_pos_w: {errors[best]:.2f} m from the joints' forward kinematics in the order of "
-            f"{' or '.join(orders)}: not this robot's"
+            f"{' or '.join(orders)}: {_other_reading(motions, given) or _FOREIGN}"
         )
-    return Motion(name=path.stem, fps=fps, body_names=g1.BODY_NAMES, joint_names=g1.JOINT_NAMES, **candidates[best])
+    return settle(candidates[best], path, given)
 
 
-def _in_table_order(values: dict[str, np.ndarray], order: Order) -> dict[str, np.ndarray]:
+def _other_reading(motions: Sequence[Motion], given: Conventions) -> str | None:
+    """Options under which forward kinematics would reproduce the bodies."""
+    for quat, angles, unit in product((given.quat, "xyzw"), (given.angles, "degrees"), (given.unit, 0.01, 0.001)):
+        other = replace(given, quat=quat, angles=angles, unit=unit)
+        if other != given and min(_kinematic_error(reread(motion, other)) for motion in motions) < _MAX_FK_ERROR:
+            pairs = (("quat", quat), ("angles", angles), ("unit", unit))
+            return f"give {' '.join(f'{key}={value}' for key, value in pairs if value != getattr(given, key))}"
+    return None
+
+
+def _in_table_order(name: str, fps: float, values: dict[str, np.ndarray], order: Order) -> Motion:
     joints, bodies = (np.argsort(index) for index in table_order(order))
-    return {key: array[:, bodies if key in _BODY_KEYS else joints] for key, array in values.items()}
+    arrays = {key: array[:, bodies if key in _BODY_KEYS else joints] for key, array in values.items()}
+    return Motion(name=name, fps=fps, body_names=g1.BODY_NAMES, joint_names=g1.JOINT_NAMES, **arrays)
 
 
-def _kinematic_error(values: dict[str, np.ndarray]) -> float:
+def _kinematic_error(motion: Motion) -> float:
     """Mean distance between the bodies and their forward kinematics over a few frames, m."""
-    frames = np.linspace(0, len(values["joint_pos"]) - 1, 10).astype(int)
-    pos, quat = values["body_pos_w"][frames], values["body_quat_w"][frames]
-    expected, _ = forward_kinematics(pos[:, 0], quat[:, 0], values["joint_pos"][frames])
+    frames = np.linspace(0, motion.num_frames - 1, 10).astype(int)
+    pos, quat = motion.body_pos_w[frames], motion.body_quat_w[frames]
+    expected, _ = forward_kinematics(pos[:, 0], quat[:, 0], motion.joint_pos[frames])
     error = np.linalg.norm(pos - expected, axis=-1).mean()
     return float(error) if np.isfinite(error) else np.inf
 
@@ -104,13 +113,13 @@ def write_mjlab(motion: Motion, path: str | Path, order: Order = "mujoco") -> tu
     arrays = {"fps": np.array([motion.fps])}
     arrays |= {key: getattr(full, key)[:, joints] for key in ("joint_pos", "joint_vel")}
     arrays |= {key: getattr(full, key)[:, bodies] for key in _BODY_KEYS}
-    return write_npz(path, arrays), _lost(full, bodies=True)
+    return write_npz(path, arrays), lost_by(full, bodies=True)
 
 
 # -- holosoma -------------------------------------------------------------------------------------------------
 
 
-def read_holosoma(path: str | Path, object_name: str | None = None) -> Motion:
+def read_holosoma(path: str | Path, object_name: str | None = None, given: Conventions | None = None) -> Motion:
     """A motion of holosoma: an npz with names, and `object_*` arrays if there is an object.
 
     Its `joint_pos` and `joint_vel` may start with the free root's 7 and 6 columns, which the root's body repeats; its
@@ -118,11 +127,12 @@ def read_holosoma(path: str | Path, object_name: str | None = None) -> Motion:
 
     Args:
         object_name: of the object's body; None takes the one body that is not the robot's, else "object".
+        given: how the file means its numbers.
 
     Raises:
-        MotionError: if the file is not such a motion.
+        MotionError: if the file is not such a motion, or looks misread, see `settle`.
     """
-    path = Path(path)
+    path, given = Path(path), given or Conventions()
     names = ("joint_names", "body_names")
     arrays = read_npz(path, {"fps", "joint_pos", "joint_vel", *names, *_BODY_KEYS, *_OBJECT_KEYS})
     num_frames = _num_frames(path, arrays, ("fps", "joint_pos", "joint_vel", *names, *_BODY_KEYS))
@@ -140,9 +150,9 @@ def read_holosoma(path: str | Path, object_name: str | None = None) -> Motion:
         keep = [i for i, name in enumerate(body_names) if name != "world"]
         body_names = tuple(body_names[i] for i in keep)
         values |= {key: values[key][:, keep] for key in _BODY_KEYS}
-    given = [key for key in _OBJECT_KEYS if key in arrays]
-    if given:
-        if len(given) != len(_OBJECT_KEYS):
+    object_keys = [key for key in _OBJECT_KEYS if key in arrays]
+    if object_keys:
+        if len(object_keys) != len(_OBJECT_KEYS):
             raise MotionError(f"{path}: lacks {', '.join(key for key in _OBJECT_KEYS if key not in arrays)}")
         if object_name is None:
             others = [name for name in body_names if name not in g1.BODY_NAMES]
@@ -156,7 +166,8 @@ def read_holosoma(path: str | Path, object_name: str | None = None) -> Motion:
             body_key = key.replace("object", "body")
             values[body_key][:, i] = checked(path, key, arrays[key], (num_frames, width), " from joint_pos")
     values["body_quat_w"] = checked_quat(path, "body_quat_w", values["body_quat_w"], body_names, "body")
-    return Motion(name=path.stem, fps=fps, body_names=body_names, joint_names=joint_names, **values)
+    motion = Motion(name=path.stem, fps=fps, body_names=body_names, joint_names=joint_names, **values)
+    return settle(reread(motion, given), path, given)
 
 
 def _names(path: Path, key: str, array: np.ndarray) -> tuple[str, ...]:
@@ -196,7 +207,7 @@ def write_holosoma(motion: Motion, path: str | Path, object_name: str | None = N
         raise MotionError(f"motion {motion.name!r}: body_names has no object {object_name!r}; it has {list(others)}")
     if object_name is None and len(others) == 1:
         object_name = others[0]
-    lost = _lost(full, bodies=False)
+    lost = lost_by(full, bodies=False)
     if object_name is not None:
         i = full.body_names.index(object_name)
         arrays |= {key: getattr(full, key.replace("object", "body"))[:, i] for key in _OBJECT_KEYS}
@@ -206,66 +217,44 @@ def write_holosoma(motion: Motion, path: str | Path, object_name: str | None = N
     return write_npz(path, arrays), lost
 
 
-# -- CSV ------------------------------------------------------------------------------------------------------
+# -- shared ---------------------------------------------------------------------------------------------------
 
 
-def read_robot_csv(path: str | Path, fps: float = 30.0) -> Motion:
-    """A robot's motion as Unitree publishes its LAFAN1: 36 columns, root position, root xyzw, 29 joints in table order.
-
-    Bodies come from forward kinematics, velocities from differences.
+def robot_motion(
+    where: object,
+    name: str,
+    fps: float,
+    root_pos: np.ndarray,
+    root_quat: np.ndarray,
+    joint_names: Sequence[str],
+    joint_pos: np.ndarray,
+    given: Conventions,
+    usual: str,
+    fields: tuple[str, str, str],
+) -> Motion:
+    """A motion of the robot alone: bodies from forward kinematics, velocities from differences.
 
     Args:
-        fps: of the rows; the file does not say.
+        where: what messages start with: file, and clip if it holds several.
+        root_pos, root_quat: float32, as the file has them. [T, 3] and [T, 4]
+        joint_names, joint_pos: in any order, rad; what the robot lacks is dropped. [T, J]
+        usual: order of quaternions in this format.
+        fields: what holds positions, orientations and joint angles in the file.
 
     Raises:
-        MotionError: if the file is not such a table.
+        MotionError: for quaternions that are not unit, or a robot that looks misread, see `settle`.
     """
-    path = Path(path)
-    fps = checked_fps(path, fps)
-    text = read_text(path)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of empty files
-            rows = np.loadtxt(text.splitlines(), delimiter=",", ndmin=2, dtype=np.float64)
-    except (ValueError, IndexError) as error:
-        raise MotionError(f"{path}: not a table of numbers: {str(error).splitlines()[0][:160]}") from error
-    if len(rows) < 2:
-        raise MotionError(f"{path}: rows: needs at least 2 frames, has {len(rows)}")
-    rows = checked(path, "rows", rows, (len(rows), _COLUMNS), ": position, xyzw, 29 joints")
-    quat = checked_quat(path, "columns 4-7", np.roll(rows[:, None, 3:7], 1, axis=-1), ["root"], "body")[:, 0]
-    pos, body_quat = forward_kinematics(rows[:, :3], quat, rows[:, 7:])
-    body_pos = checked(path, "rows", pos, pos.shape)
-    body_pos[:, 0] = rows[:, :3]
-    body_quat[:, 0] = quat
-    return Motion(
-        name=path.stem,
-        fps=fps,
-        body_names=g1.BODY_NAMES,
-        joint_names=g1.JOINT_NAMES,
-        body_pos_w=body_pos,
-        body_quat_w=body_quat.astype(np.float32),
-        body_lin_vel_w=derivative(pos, fps).astype(np.float32),
-        body_ang_vel_w=angular_velocity(body_quat, fps).astype(np.float32),
-        joint_pos=rows[:, 7:],
-        joint_vel=derivative(rows[:, 7:], fps).astype(np.float32),
-    )
-
-
-def write_robot_csv(motion: Motion, path: str | Path) -> tuple[Path, list[str]]:
-    """Writes the table that `read_robot_csv` reads, with all digits of float32.
-
-    Returns:
-        The file, and what of the motion it cannot hold.
-    """
-    full = complete_robot(motion)
-    xyzw = np.roll(full.body_quat_w[:, 0], -1, axis=-1)
-    rows = np.concatenate([full.body_pos_w[:, 0], xyzw, full.joint_pos[:, : len(g1.JOINT_NAMES)]], axis=1)
-    text = "".join(",".join(f"{value:.9g}" for value in row) + "\n" for row in rows)
-    lost = [*_lost(full, bodies=True), "the rate", "velocities", "bodies other than the root"]
-    return write_text(path, text), lost
-
-
-# -- shared ---------------------------------------------------------------------------------------------------
+    quat = checked_quat(where, fields[1], given.wxyz(root_quat, usual)[:, None], ["root"], "body")[:, 0]
+    pos = checked(where, fields[0], given.metres(root_pos), root_pos.shape)
+    kept = [i for i, joint in enumerate(joint_names) if joint in g1.JOINT_NAMES]
+    joint_names, joint_pos = tuple(joint_names[i] for i in kept), joint_pos[:, kept]
+    table = np.tile(default_joint_pos(), (len(pos), 1))
+    table[:, [g1.JOINT_NAMES.index(joint) for joint in joint_names]] = joint_pos
+    body_pos, body_quat = forward_kinematics(pos, quat, table)
+    body_pos[:, 0], body_quat[:, 0] = pos, quat
+    checked(where, fields[0], body_pos, body_pos.shape)
+    motion = motion_from_poses(name, fps, g1.BODY_NAMES, joint_names, body_pos, body_quat, joint_pos)
+    return settle(motion, where, given, usual=usual, fields=fields)
 
 
 def _num_frames(path: Path, arrays: dict[str, np.ndarray], required: tuple[str, ...]) -> int:
@@ -283,7 +272,7 @@ def _fps(path: Path, array: np.ndarray) -> float:
     return checked_fps(path, float(checked(path, "fps", array.reshape(array.shape or (1,)), (1,))[0]))
 
 
-def _lost(full: Motion, *, bodies: bool) -> list[str]:
+def lost_by(full: Motion, *, bodies: bool) -> list[str]:
     """What formats of the robot alone leave out of a completed motion."""
     lost = []
     if others := full.joint_names[len(g1.JOINT_NAMES) :]:
