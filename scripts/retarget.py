@@ -5,10 +5,11 @@
         [angles=degrees] [self_collision=true] [name=NAME]
 
 Formats: `gvhmr` (hmr4d_results.pt; needs source_fps, the video's), `amass` (npz), `omomo` (npz), `intermimic` (pt),
-`bvh`; guessed from the file if not given. Where a file's world is not as usual: `source_fps` overrules its rate, `up` is
-its axis that points up (x, y, z, -x, -y or -z), `unit` that of its lengths in metres, `ground` whether to `shift` the
-lowest sole onto the ground or to `keep` it where it is. For a BVH, `names` is a YAML file of SMPL's names by the file's
-(`Bip01_L_Thigh: left_hip`), and `angles` may be `radians`. The report has notes of what was changed or not used.
+`bvh`; guessed from the file if not given. Where a file's world is not as usual: `source_fps` overrules its rate, `up`
+is the axis that points up (x, y, z, -x, -y or -z), `unit` its unit of length in metres, `ground` whether to `shift` the
+lowest sole onto the ground or to `keep` its height (shifted if more than 5 cm off). For a BVH, `names` is a YAML file
+with SMPL's names by the file's (`Bip01_L_Thigh: left_hip`), and `angles` may be `radians`. The report has notes of what
+was changed or not used.
 `object` is the task that describes the object of the motion, and the end effectors, whose contact labels the source may
 have. Lengths of the scene are scaled so that the person's legs become as long as the robot's, unless `scale` says
 otherwise; `height` is the person's, if the file does not tell. What is faster than `cutoff` Hz is taken for noise.

@@ -59,8 +59,8 @@ class RetargetOptions:
         fps: of the result.
         cutoff: what is faster in the person's motion is taken for noise, Hz.
         scale: of the scene; None: the length of the robot's legs over that of the person's.
-        ground: `shift` the person vertically until the lowest sole touches the ground, `keep` the height, or None: shift
-            if the sole misses the ground by more than 5 cm.
+        ground: `shift` the person vertically until the lowest sole touches the ground, `keep` the height, or None:
+            shift if the sole misses the ground by more than 5 cm.
         ik: of the inverse kinematics; by default it keeps the robot out of floor, object and itself.
     """
 

@@ -70,7 +70,7 @@ def read_bvh(
     with reading(path):
         rate, notes = _rate(fps, frame_time)
         unit = unit_of(world, 0.01)
-        kept, dropped = without_blank_ends(~values.any(1))
+        kept, dropped = without_blank_ends(values)
         pos, mat = _pose(joints, values[kept], _in_radians(joints, values, angles))
         theirs = [joint.name for joint in joints]
         ours = smpl_names(theirs, None if names is None else read_names(names, theirs))
@@ -142,8 +142,9 @@ def _parse_hierarchy(path: Path, tokens: list[str]) -> list[_Joint]:
             if not stack or stack[-1] < 0 or not tokens[i + 1 : i + 2] or not tokens[i + 1].isdecimal():
                 raise MotionError(f"{path}: HIERARCHY: CHANNELS of no joint, or without their count")
             count = min(int(tokens[i + 1][:9]), len(tokens))
-            channels = [channel.capitalize() for channel in tokens[i + 2 : i + 2 + count]]
-            unknown = [channel for channel in channels if channel not in _CHANNELS]
+            named = tokens[i + 2 : i + 2 + count]
+            channels = [channel.capitalize() for channel in named]
+            unknown = [channel for channel in named if channel.capitalize() not in _CHANNELS]
             if unknown or len(channels) != count or len(set(channels)) != count:
                 wrong = f"{unknown[0][:40]!r} is none" if unknown else "each at most once"
                 raise MotionError(

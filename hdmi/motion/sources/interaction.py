@@ -85,7 +85,7 @@ def read_omomo(path: str | Path, fps: float | None = None, **world: Unpack[World
         rest, _ = skeleton.forward(np.zeros((1, count, 3)), np.zeros((1, 3)))
         skeleton = replace(skeleton, height=checked_height(height_from_legs(names, rest), unit, world, None))
         rate, notes = fps_of(fps, _FPS, "OMOMO")
-        kept, dropped = without_blank_ends(~np.concatenate([root, body, trans], axis=1).any(1))
+        kept, dropped = without_blank_ends(np.concatenate([root, body, trans], axis=1))
         motion = pose_skeleton(name, skeleton, rotation[kept], trans[kept] * unit, rate, y_up=False)
         quat = Rotation.from_matrix(obj_rot).as_quat(scalar_first=True)
         thing = ObjectTrajectory(_object_of(name), obj_pos[kept] * unit, quat[kept])
@@ -99,7 +99,7 @@ def read_intermimic(
 
     Columns: root 0-7, joints 9-162, body positions 162-318, object pose 318-325 (xyzw), contact of the object 330 and
     of the 52 bodies 331-383 (1 touches, -1 must not), body orientations 383-591 (xyzw). Contacts of fingers count as
-    their wrist's. Blank frames at the start and the end, which the project's own retargeted sequences have, are dropped.
+    their wrist's. Blank frames at start and end, which the project's own retargeted sequences have, are dropped.
 
     Args:
         height: of the person, m; from the length of the legs if not given.
@@ -120,7 +120,7 @@ def read_intermimic(
         raise MotionError(f"{path}: tensor: needs at least 2 frames, has {num_frames}")
     data = checked(path, "tensor", data, data.shape)
     quat, obj_quat = _wxyz(data[:, 383:].reshape(num_frames, _BODIES, 4)), _wxyz(data[:, None, 321:325])
-    kept, dropped = without_blank_ends(~(data[:, 162:318].any(1) | data[:, 383:].any(1)))
+    kept, dropped = without_blank_ends(np.concatenate([data[:, 162:318], data[:, 383:]], axis=1))
     ends = np.ones(num_frames, bool)
     ends[kept] = False  # checked as the identity and dropped afterwards, so that messages have the file's frames
     quat[ends], obj_quat[ends] = [1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]

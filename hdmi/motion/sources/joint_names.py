@@ -96,14 +96,15 @@ def read_names(path: str | Path, theirs: Sequence[str]) -> dict[str, str]:
     if not isinstance(values, dict) or not values:
         raise MotionError(f"{path}: lines such as 'Bip01_L_Thigh: left_hip' expected, the file's name and SMPL's")
     found: dict[str, str] = {}
-    for name, joint in values.items():
+    for key, joint in values.items():
+        name = str(key)
         if joint not in SMPL_JOINTS:
             raise MotionError(f"{path}: {name}: {joint!r} is none of SMPL's joints: {', '.join(SMPL_JOINTS)}")
         if name not in theirs:
             raise MotionError(f"{path}: {name}: there is no such joint among {', '.join(theirs)}")
         if joint in found.values():
             raise MotionError(f"{path}: {name}: {joint} is another joint's name already")
-        found[str(name)] = str(joint)
+        found[name] = joint
     return found
 
 

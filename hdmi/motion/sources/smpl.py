@@ -104,15 +104,16 @@ def read_amass(
             raise MotionError(f"{path}: poses: shape {poses.shape}, expected (T, {_BODY} or more)")
         pose = checked(path, "poses", poses[:, :_BODY], (num_frames, _BODY), f" from {trans_key}")
     else:
-        assert root_key is not None and pose_key is not None
+        assert root_key is not None
+        assert pose_key is not None
         root = checked(path, root_key, arrays[root_key], (num_frames, 3), f" from {trans_key}")
         body = checked(path, pose_key, arrays[pose_key], (num_frames, _BODY - 3), f" from {trans_key}")
         pose = np.concatenate([root, body], axis=1)
     trans = checked(path, trans_key, arrays[trans_key], (num_frames, 3))
     rate_key = _first(arrays, _RATES)
     with reading(path):
-        told = None if rate_key is None else _rate(rate_key, arrays[rate_key])
-        rate, notes = fps_of(fps, told, rate_key or f"none of {', '.join(_RATES)} is there: the file")
+        told = None if rate_key is None else _rate(rate_key, arrays[rate_key], needed=fps is None)
+        rate, notes = fps_of(fps, told, rate_key or " or ".join(_RATES))
         betas = arrays.get("betas", np.zeros(1))
         motion = _posed(path, path.stem, pose, trans, betas, rate, height, body_model, "z", world)
         return replace(motion, notes=(*notes, *motion.notes))
@@ -122,14 +123,17 @@ def _first(arrays: Mapping[str, np.ndarray], keys: tuple[str, ...]) -> str | Non
     return next((key for key in keys if key in arrays), None)
 
 
-def _rate(key: str, value: np.ndarray) -> float:
-    """A number, or text that is one."""
+def _rate(key: str, value: np.ndarray, *, needed: bool) -> float | None:
+    """A number, or text that is one; None if it is neither and not needed."""
     if value.size == 1 and value.dtype.kind in "fiuSU":
         try:
             return float(value.reshape(()).astype(str if value.dtype.kind in "SU" else float).item())
-        except ValueError as error:
-            raise MotionError(f"{key}: a number expected: {error}") from error
-    raise MotionError(f"{key}: one number expected, got shape {value.shape} of {value.dtype}")
+        except ValueError:
+            pass
+    if not needed:
+        return None
+    got = repr(value.item()) if value.size == 1 else f"shape {value.shape}"
+    raise MotionError(f"{key}: one number expected, got {got[:40]}; give source_fps")
 
 
 def _posed(
@@ -145,7 +149,7 @@ def _posed(
     world: World,
 ) -> HumanMotion:
     unit = unit_of(world, 1.0)
-    kept, notes = without_blank_ends(~np.concatenate([pose, transl], axis=1).any(1))
+    kept, notes = without_blank_ends(np.concatenate([pose, transl], axis=1))
     pose, transl = pose[kept], transl[kept] * unit
     if betas.ndim not in (1, 2) or not betas.size:
         raise MotionError(f"betas: shape {betas.shape}, expected (S,) or (T, S)")
@@ -155,7 +159,7 @@ def _posed(
     angles = np.median(np.linalg.norm(rotation, axis=-1), axis=0) if len(rotation) else np.zeros(1)
     if (largest := float(angles.max())) > _LARGEST_ANGLE:
         joint = SMPL_JOINTS[int(angles.argmax())]
-        raise MotionError(f"rotation of {joint!r}: {largest:.3g} in the median frame: radians expected, are these degrees?")
+        raise MotionError(f"rotation of {joint!r}: {largest:.3g} in the median frame: are these degrees, not radians?")
     if body_model is None:
         skeleton = anthropometric_skeleton(height_from_betas(shape) if height is None else height)
     elif height is None:

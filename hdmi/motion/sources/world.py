@@ -66,7 +66,7 @@ def fps_of(given: float | None, told: float | None, source: str) -> tuple[float,
     """The rate that is given, or else the one that is told, and a note if both are and they differ.
 
     Args:
-        source: what tells it, for the messages.
+        source: what tells it or would have, for the messages.
 
     Raises:
         MotionError: if there is none, or it cannot be one.
@@ -77,7 +77,7 @@ def fps_of(given: float | None, told: float | None, source: str) -> tuple[float,
             return fps, ()
         return fps, (f"read at the {fps:g} fps that source_fps says; {source} says {told:g}",)
     if told is None:
-        raise MotionError(f"{source}: does not say the frames per second: give source_fps")
+        raise MotionError(f"no {source} says how many frames a second has: give source_fps")
     try:
         return checked_fps(source, told), ()
     except MotionError as error:
@@ -110,21 +110,21 @@ def checked_height(legs: float, unit: float, world: World, height: float | None)
     raise MotionError(f"height: by its legs the person is {legs:.3g} m tall: is unit={unit:g} m right?{hint}")
 
 
-def without_blank_ends(blank: np.ndarray) -> tuple[slice, tuple[str, ...]]:
+def without_blank_ends(rows: np.ndarray) -> tuple[slice, tuple[str, ...]]:
     """Which frames are left without the blank ones before and after the motion, and a note if some are not.
 
     Nothing is dropped if fewer than 2 frames would be left.
 
     Args:
-        blank: frames in which the file holds zeros only. bool [T]
+        rows: that are all zero where a frame is blank. [T, W]
     """
-    full = np.flatnonzero(~blank)
-    if len(full) < 2 or len(full) == len(blank):
+    full = np.flatnonzero((rows != 0).sum(1))
+    if len(full) < 2 or len(full) == len(rows):
         return slice(None), ()
     first, last = int(full[0]), int(full[-1])
     dropped = [
         f"{stop - start} blank frame{'s' * (stop - start > 1)} {where}"
-        for start, stop, where in ((0, first, "at the start"), (last + 1, len(blank), "at the end"))
+        for start, stop, where in ((0, first, "at the start"), (last + 1, len(rows), "at the end"))
         if stop > start
     ]
     return slice(first, last + 1), ((f"dropped {' and '.join(dropped)}",) if dropped else ())
