@@ -244,7 +244,7 @@ class TestUnit:
     def test_a_bvh_in_another_unit_is_asked_about(self, tmp_path: Path, unit: float, hint: str) -> None:
         path = write_person(tmp_path / "a.bvh", unit=unit)
         for height in (None, 1.75):
-            with pytest.raises(MotionError, match=f"is unit=0.01 m right[?]; {hint}.* makes it 1.7"):
+            with pytest.raises(MotionError, match=f"is unit=0.01 m right[?] {hint}.* makes it 1.7"):
                 read_bvh(path, height)
         given = read_bvh(path, unit=unit)
         np.testing.assert_allclose(given.joint_pos, read_bvh(write_person(tmp_path / "b.bvh")).joint_pos, atol=1e-5)
@@ -255,6 +255,10 @@ class TestUnit:
             read_bvh(path)
         assert read_bvh(path, unit=0.01).height == pytest.approx(0.876, abs=0.01)
         assert read_bvh(path, height=0.9).height == 0.9
+        with pytest.raises(MotionError, match=r"by its legs the person is 0.87\d m tall, not 1.75: .*give unit=0.01 if it is"):
+            read_bvh(write_person(tmp_path / "b.bvh", unit=0.02), height=1.75)
+        with pytest.raises(MotionError, match=r"height: metres, from 0.5 to 2.5, expected, got 175"):
+            read_bvh(path, height=175.0)
 
     @pytest.mark.parametrize("form", ["amass", "omomo", "intermimic", "gvhmr"])
     def test_units_of_the_others(self, tmp_path: Path, form: str) -> None:

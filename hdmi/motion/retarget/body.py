@@ -103,7 +103,7 @@ def read_body(human: HumanMotion, cutoff: float) -> Body:
     missing = [name for name in _REQUIRED if name not in human.joint_names]
     if missing:
         others = ", ".join(name for name in human.joint_names if name not in SMPL_JOINTS)
-        hint = f"; of joints with other names it has {others}" if others else ""
+        hint = f"; of joints with other names it has {others} (names=FILE maps a BVH's)" if others else ""
         raise MotionError(f"motion {human.name!r}: retargeting needs the joints {missing}{hint}")
     smooth = low_pass(human.joint_pos.astype(float), human.fps, cutoff)
     pos = {name: smooth[:, i] for i, name in enumerate(human.joint_names)}

@@ -94,6 +94,8 @@ def checked_height(legs: float, unit: float, world: World, height: float | None)
         MotionError: if the legs are no person's, or not those of a person of this height. Names the unit with which
             they would be.
     """
+    if height is not None and not 0.5 <= height <= _PERSON[1]:
+        raise MotionError(f"height: metres, from 0.5 to {_PERSON[1]:g}, expected, got {height:g}")
     known = legs if height is None else height
     believed = world.get("unit") is not None or height is not None
     lowest, highest = (0.5, _PERSON[1]) if believed else _PERSON
@@ -106,8 +108,9 @@ def checked_height(legs: float, unit: float, world: World, height: float | None)
         for other, person in others
         if _ADULT[0] <= person <= _ADULT[1]
     ]
-    hint = f"; {hints[0]}" if hints else ""
-    raise MotionError(f"height: by its legs the person is {legs:.3g} m tall: is unit={unit:g} m right?{hint}")
+    hint = hints[0] if hints else f"give unit={unit:g} if it is"
+    other = "" if height is None else f", not {height:g}"
+    raise MotionError(f"height: by its legs the person is {legs:.3g} m tall{other}: is unit={unit:g} m right? {hint}")
 
 
 def without_blank_ends(rows: np.ndarray) -> tuple[slice, tuple[str, ...]]:
