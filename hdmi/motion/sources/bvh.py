@@ -224,11 +224,13 @@ def _rate(given: float | None, frame_time: float) -> tuple[float, tuple[str, ...
 def _in_radians(joints: list[_Joint], values: np.ndarray, angles: str | None) -> bool:
     if angles not in (None, *ANGLES):
         raise MotionError(f"angles: {' or '.join(ANGLES)} expected, got {angles!r}")
-    kinds = np.array([channel[1:] for joint in joints for channel in joint.channels])
-    largest = np.abs(values[:, kinds == "rotation"]).max(0, initial=0.0)
+    # the root may have turned around several times
+    inner = [joint.parent >= 0 and channel.endswith("rotation") for joint in joints for channel in joint.channels]
+    largest = np.abs(values[:, inner]).max(0, initial=0.0)
     if angles is None and largest.max(initial=0.0) <= 2 * np.pi and (largest > _TURNED).sum() >= _TURNS:
         raise MotionError(
-            f"MOTION: no angle exceeds {largest.max():.2f}: are they in radians? Give angles=radians, or angles=degrees"
+            f"MOTION: no joint turns by more than {largest.max():.2f}: are angles in radians? Give angles=radians, or "
+            "angles=degrees"
         )
     return angles == "radians"
 
