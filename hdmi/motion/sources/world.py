@@ -174,8 +174,8 @@ def _check_lengths(motion: HumanMotion, unit: float) -> None:
     speed = float(steps.mean()) * motion.fps if len(steps) else 0.0
     if speed > _FASTEST:
         raise MotionError(
-            f"the pelvis moves at {speed:.3g} m/s on average: is unit={unit:g} m right, and {motion.fps:g} fps? Give unit "
-            "or source_fps"
+            f"the pelvis moves at {speed:.3g} m/s on average: is unit={unit:g} m right, and {motion.fps:g} fps? "
+            "Give unit or source_fps"
         )
     if (distance := float(np.abs(path).max())) > _REMOTEST:
         raise MotionError(f"the pelvis is {distance:.3g} m from the origin: is unit={unit:g} m right? Give it")
