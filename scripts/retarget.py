@@ -1,10 +1,15 @@
 """Makes a reference of the robot from a person's motion, with inverse kinematics (extra `retarget`).
 
     python scripts/retarget.py source=PATH out=FOLDER [format=FORMAT] [object=TASK] [height=1.75] [source_fps=30]
-        [fps=50] [scale=0.72] [cutoff=6] [body_model=PATH] [unit=0.01] [up=y] [self_collision=true] [name=NAME]
+        [fps=50] [scale=0.72] [cutoff=6] [body_model=PATH] [up=y] [unit=0.01] [ground=shift] [names=FILE]
+        [angles=degrees] [self_collision=true] [name=NAME]
 
 Formats: `gvhmr` (hmr4d_results.pt; needs source_fps, the video's), `amass` (npz), `omomo` (npz), `intermimic` (pt),
-`bvh` (centimetres and y up unless `unit`, in metres, and `up` say otherwise); guessed from the file if not given.
+`bvh`; guessed from the file if not given. Where a file's world is not as usual: `source_fps` overrules its rate, `up`
+is the axis that points up (x, y, z, -x, -y or -z), `unit` its unit of length in metres, `ground` whether to `shift` the
+lowest sole onto the ground or to `keep` its height (shifted if more than 5 cm off). For a BVH, `names` is a YAML file
+with SMPL's names by the file's (`Bip01_L_Thigh: left_hip`), and `angles` may be `radians`. The report has notes of what
+was changed or not used.
 `object` is the task that describes the object of the motion, and the end effectors, whose contact labels the source may
 have. Lengths of the scene are scaled so that the person's legs become as long as the robot's, unless `scale` says
 otherwise; `height` is the person's, if the file does not tell. What is faster than `cutoff` Hz is taken for noise.
@@ -46,8 +51,11 @@ class Options:
     height: float | None = None
     source_fps: float | None = None
     body_model: str | None = None
-    unit: float | None = None
     up: str | None = None
+    unit: float | None = None
+    ground: str | None = None
+    names: str | None = None
+    angles: str | None = None
     fps: float = 50.0
     scale: float | None = None
     cutoff: float = 6.0
@@ -67,8 +75,11 @@ def run(options: Options, console: Console) -> tuple[Path, RetargetReport]:
         source_fps=options.source_fps,
         height=options.height,
         body_model=options.body_model,
-        unit=options.unit,
+        names=options.names,
+        angles=options.angles,
         up=options.up,
+        unit=options.unit,
+        ground=options.ground,
     )
     human = replace(human, name=options.name or Path(options.out).name)
     parts: dict[str, Any] = {} if options.object is None else scene_parts(task_config(options.object))
@@ -76,6 +87,7 @@ def run(options: Options, console: Console) -> tuple[Path, RetargetReport]:
         fps=options.fps,
         cutoff=options.cutoff,
         scale=options.scale,
+        ground=options.ground,
         ik=IkOptions(floor=0.0, smoothing=SMOOTHING, self_collision=0.005 if options.self_collision else None),
     )
     num_frames = human.resample(options.fps).num_frames

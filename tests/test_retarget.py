@@ -12,7 +12,7 @@ import people
 import pytest
 from mocks import load_script
 from scipy.spatial.transform import Rotation
-from sources import write_gvhmr
+from sources import write_amass, write_gvhmr
 
 from hdmi.assets import Effector, HingeConfig, ObjectConfig, g1
 from hdmi.motion import HumanMotion, Motion, MotionError, ObjectTrajectory, load_motion, make_reference, save_motion
@@ -285,7 +285,9 @@ class TestRefusals:
     def test_missing_joints_are_named(self):
         human = people.squat(seconds=0.3)
         names = tuple("shoulder?" if name == "left_shoulder" else name for name in human.joint_names)
-        with pytest.raises(MotionError, match=r"'person': retargeting needs the joints \['left_shoulder'\]"):
+        with pytest.raises(
+            MotionError, match=r"needs the joints \['left_shoulder'\]; .* other names it has shoulder\?"
+        ):
             retarget(replace(human, joint_names=names))
 
     def test_an_object_without_poses(self):
@@ -336,6 +338,37 @@ def test_the_robots_own_walk_and_kneel_come_back(public_motions: Path, name: str
     assert error.max() < 40
 
 
+class TestGround:
+    def test_who_floats_or_sinks_is_shifted_and_told(self):
+        human = people.squat(seconds=0.3)
+        plain, _ = retarget(human)
+        for height, told in ((0.3, "shifted by -0.30 m"), (-0.5, "shifted by +0.50 m")):
+            motion, report = retarget(human.shifted(np.array([0.0, 0.0, height])))
+            np.testing.assert_allclose(motion.joint_pos, plain.joint_pos, atol=2e-3)
+            np.testing.assert_allclose(motion.body_pos_w, plain.body_pos_w, atol=2e-3)
+            assert told in report.notes[0]
+
+    def test_the_object_is_shifted_along(self):
+        human = people.reach()
+        thing = replace(human.object, pos=human.object.pos[:20], quat=human.object.quat[:20])
+        human = replace(human, joint_pos=human.joint_pos[:20], joint_quat=human.joint_quat[:20], object=thing)
+        plain, raised = (retarget(human.shifted(np.array([0.0, 0.0, up]))) for up in (0.0, 0.4))
+        np.testing.assert_allclose(body(raised[0], "box"), body(plain[0], "box"), atol=1e-5)
+
+    def test_who_is_to_keep_their_height_does(self):
+        raised = people.squat(seconds=0.3).shifted(np.array([0.0, 0.0, 0.5]))
+        motion, report = retarget(raised, options=RetargetOptions(ground="keep"))
+        assert body(motion, "left_ankle_roll_link")[:, 2].min() > 0.3
+        assert report.notes == ["the lowest sole is 0.50 m above the ground, and kept there"]
+
+    def test_who_is_out_of_reach_of_the_ground_is_asked_about(self):
+        high = people.squat(seconds=0.3).shifted(np.array([0.0, 0.0, 40.0]))
+        with pytest.raises(MotionError, match=r"'person'.*40\.00 m above the ground: .*ground=shift"):
+            retarget(high)
+        with pytest.raises(MotionError, match="ground: shift or keep expected, got 'lift'"):
+            retarget(high, options=RetargetOptions(ground="lift"))
+
+
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
     return load_script("retarget")
@@ -349,6 +382,13 @@ class TestScript:
         assert load_motion(out).fps == 50.0
         assert json.loads((out / "retarget.json").read_text())["name"] == "wave"
 
+    def test_notes_are_shown_and_kept(self, script, tmp_path, capsys):
+        source, out = write_amass(tmp_path / "walk.npz", "smplh"), tmp_path / "walk"
+        assert script.main([f"source={source}", "source_fps=60", "up=z", f"out={out}"]) == 0
+        told = "read at the 60 fps that source_fps says; mocap_framerate says 120"
+        assert told in capsys.readouterr().out
+        assert told in json.loads((out / "retarget.json").read_text())["notes"]
+
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
@@ -357,8 +397,7 @@ class TestScript:
             (["source=hmr4d_results.pt", "out=x"], "how fast the video is: give source_fps"),
             (["source=x.csv", "out=x"], "say which format"),
             (["source=none.bvh", "out=x", "format=fbx"], "there is no format 'fbx'"),
-            (["source=none.bvh", "out=x", "source_fps=30"], "bvh takes no source_fps; it takes height, unit, up"),
-            (["source=none.bvh", "out=x", "up=x"], "up: the axis that points up is y or z, got 'x'"),
+            (["source=none.bvh", "out=x", "body_model=x"], "bvh takes no body_model; it takes source_fps, up, unit"),
             (["source=none.bvh", "out=x", "cutoff=0"], "cutoff: expected more than 0, got 0"),
         ],
     )

@@ -286,9 +286,11 @@ class TestPerson:
     def test_what_does_not_fit_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(MotionError, match="give source_fps"):
             read_person(write_gvhmr(tmp_path / "results.pt"))
-        with pytest.raises(MotionError, match="amass takes no source_fps; it takes height, body_model"):
-            read_person(write_amass(tmp_path / "b.npz", "smplh"), source_fps=60.0)
-        with pytest.raises(MotionError, match="omomo takes no height; it takes nothing"):
+        with pytest.raises(
+            MotionError, match="amass takes no names; it takes source_fps, up, unit, ground, height, body"
+        ):
+            read_person(write_amass(tmp_path / "b.npz", "smplh"), names="names.yaml")
+        with pytest.raises(MotionError, match="omomo takes no height; it takes source_fps, up, unit, ground"):
             read_person(write_omomo(tmp_path / "a.npz"), height=1.7)
 
 

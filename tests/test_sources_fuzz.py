@@ -15,6 +15,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from sources import robot_arrays, write_amass, write_bvh, write_gmr, write_gvhmr, write_intermimic, write_omomo
 
 import hdmi.motion.sources as readers
@@ -226,6 +227,56 @@ words = st.one_of(
 @given(text=st.lists(words, max_size=60).map(" ".join))
 def test_text_that_resembles_a_bvh(text: str) -> None:
     assert check("bvh", text.encode("utf-8", "replace"))
+
+
+@FEW
+@given(data=st.data())
+def test_a_bvh_in_any_case_and_spacing_is_the_same(samples: dict[str, bytes], data: st.DataObject) -> None:
+    text = samples["bvh"].decode()
+    for word in (
+        "HIERARCHY",
+        "ROOT",
+        "JOINT",
+        "End Site",
+        "OFFSET",
+        "CHANNELS",
+        "Zrotation",
+        "MOTION",
+        "Frames",
+        "Time",
+    ):
+        case = data.draw(st.sampled_from([str.upper, str.lower, str.capitalize, str.swapcase]))
+        text = text.replace(word, case(word))
+    for old, new in (("\n", ["\n", "\r\n", "\n\n", " \n\t"]), (": ", [":", ": ", ":\t", " : "])):
+        text = text.replace(old, data.draw(st.sampled_from(new)))
+    with tempfile.TemporaryDirectory() as folder:
+        path, other = Path(folder) / "a.bvh", Path(folder) / "b.bvh"
+        path.write_bytes(samples["bvh"])
+        other.write_text(data.draw(st.sampled_from(["", "\ufeff"])) + text, newline="")
+        np.testing.assert_array_equal(readers.read_bvh(other).joint_pos, readers.read_bvh(path).joint_pos)
+
+
+@settings(max_examples=60)
+@given(turn=st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))
+def test_a_person_in_any_world_stands_or_is_told_not_to(turn: list[float]) -> None:
+    """Whatever the axes of a file: its person stands, or the error names the axis to stand along, or a note says so."""
+    world = Rotation.from_quat(turn)
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_amass(Path(folder) / "a.npz", "smplh")
+        with np.load(path) as file:
+            poses, trans = file["poses"], file["trans"]
+        poses[:, :3] = (world * Rotation.from_rotvec(poses[:, :3])).as_rotvec()
+        write_amass(path, "smplh", poses=poses, trans=world.apply(trans))
+        try:
+            motion = readers.read_amass(path)
+        except MotionError as error:
+            up = str(error).partition("give up=")[2].partition(",")[0]
+            motion = readers.read_amass(path, up=up)
+            least = 0.8
+        else:
+            least = -1.0 if any("trunk leans" in note for note in motion.notes) else 0.5
+    trunk = np.median(motion.pos("neck") - motion.pos("pelvis"), axis=0)
+    assert trunk[2] > (least - 0.1) * np.linalg.norm(trunk)
 
 
 @FEW

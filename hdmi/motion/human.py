@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hdmi.motion.check import MotionError, checked, checked_fps, checked_labels, checked_names, checked_quat
 from hdmi.motion.kinematics import interpolate, interpolate_quat, nearest_frames, resampled_times
@@ -69,6 +70,7 @@ class HumanMotion:
     object: ObjectTrajectory | None = None
     contact: np.ndarray | None = None  # bool [T, E]: which effectors touch the object
     contact_names: tuple[str, ...] = ()  # of the E effectors: names of joints
+    notes: tuple[str, ...] = ()  # what its reader did or could not do, for people; one sentence each
 
     def __post_init__(self) -> None:
         where = f"motion {self.name!r}"
@@ -118,6 +120,18 @@ class HumanMotion:
         moved = self.object and replace(self.object, pos=self.object.pos + offset)
         return replace(self, joint_pos=self.joint_pos + offset, object=moved)
 
+    def turned(self, rotation: Rotation) -> HumanMotion:
+        """The motion, object included, turned about the origin by one rotation."""
+        quat = self.joint_quat
+        if quat is not None:
+            quat = (rotation * Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True)).as_quat(scalar_first=True)
+            quat = quat.reshape(*self.joint_pos.shape[:2], 4)
+        thing = self.object
+        if thing is not None:
+            poses = rotation * Rotation.from_quat(thing.quat, scalar_first=True)
+            thing = replace(thing, pos=_turned(thing.pos, rotation), quat=poses.as_quat(scalar_first=True))
+        return replace(self, joint_pos=_turned(self.joint_pos, rotation), joint_quat=quat, object=thing)
+
     def resample(self, fps: float) -> HumanMotion:
         """The motion at another rate: positions linear, orientations slerp, labels nearest."""
         if abs(self.fps - fps) < 1e-6:
@@ -139,6 +153,10 @@ class HumanMotion:
             object=thing,
             contact=None if self.contact is None else self.contact[nearest_frames(old, new)],
         )
+
+
+def _turned(points: np.ndarray, rotation: Rotation) -> np.ndarray:
+    return points @ rotation.as_matrix().T
 
 
 def _checked_object(where: str, thing: ObjectTrajectory, num_frames: int) -> ObjectTrajectory:

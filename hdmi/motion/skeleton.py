@@ -7,7 +7,7 @@ it. Whoever has the body model's own file can take its joints instead (`body_mod
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,10 @@ _REST = {
 }
 # Where SMPL's translation is measured from: its origin is at the chest, this far above the pelvis.
 _ORIGIN_ABOVE_PELVIS = 0.14
+
+GROUNDS = ("shift", "keep")
+_SLACK = 0.05  # m; retargeting puts a sole on the ground that misses it by less
+_FARTHEST = 10.0  # m, of a person from the ground
 
 UPRIGHT = Rotation.from_quat([0.5, 0.5, 0.5, 0.5])  # of a T-pose that faces world x: x left, y up, z forward
 
@@ -185,32 +189,65 @@ def height_from_legs(joint_names: Sequence[str], joint_pos: np.ndarray) -> float
     Raises:
         MotionError: without hip, knee and ankle of a side.
     """
-    lengths = []
+    lengths, missing = [], []
     for side in ("left", "right"):
         parts = [f"{side}_{part}" for part in ("hip", "knee", "ankle")]
+        missing += [part for part in parts if part not in joint_names]
         if all(part in joint_names for part in parts):
             hip, knee, ankle = (joint_pos[:, list(joint_names).index(part)] for part in parts)
             length = np.linalg.norm(hip - knee, axis=-1) + np.linalg.norm(knee - ankle, axis=-1)
             lengths.append(np.median(length))
     if not lengths:
-        raise MotionError("height: cannot be told from the legs without hip, knee and ankle; give it")
+        raise MotionError(f"height: cannot be told from the legs, which lack {', '.join(missing)}; give height")
     return float(np.mean(lengths)) / (_REST["hip"][1] - _REST["ankle"][1])
 
 
-def stand_on_ground(motion: HumanMotion) -> HumanMotion:
-    """The motion shifted vertically until its lowest sole touches the ground.
+def height_above_ground(motion: HumanMotion) -> float | None:
+    """How far the lowest sole is above the ground, m; below zero, the ground is above it.
 
     Soles are the feet's resting height below the joints `left_ankle`, `right_ankle`, `left_foot` and `right_foot`,
-    those of them that the motion has. For sources that do not know where the joints of this body are above the ground.
-    The 1st percentile over frames counts, not one outlier.
+    those of them that the motion has; none: None. Another joint that is lower counts too: somebody may stand on their
+    hands. The 1st percentile over frames counts, not one outlier.
     """
+    soles = {f"{side}_{part}": _REST[part][1] for side in ("left", "right") for part in ("ankle", "foot")}
+    if not soles.keys() & set(motion.joint_names):
+        return None
     gaps = [
-        motion.pos(f"{side}_{part}")[:, 2] - _REST[part][1] * motion.height
-        for side in ("left", "right")
-        for part in ("ankle", "foot")
-        if f"{side}_{part}" in motion.joint_names
+        motion.pos(joint)[:, 2] - soles.get(joint, 0.0) * motion.height
+        for joint in motion.joint_names
+        if joint in SMPL_JOINTS
     ]
-    if not gaps:
+    return float(np.percentile(np.min(gaps, axis=0), 1))
+
+
+def stand_on_ground(motion: HumanMotion) -> HumanMotion:
+    """The motion shifted vertically until its lowest sole touches the ground (`height_above_ground`)."""
+    gap = height_above_ground(motion)
+    return motion if gap is None else motion.shifted(np.array([0.0, 0.0, -gap], np.float32))
+
+
+def grounded(motion: HumanMotion, ground: str | None, slack: float = _SLACK) -> HumanMotion:
+    """The motion with its lowest sole on the ground, or a note of how far it is from it.
+
+    Args:
+        ground: `shift` it there, `keep` its height, or None: shift what misses the ground by more than `slack`.
+        slack: m.
+
+    Raises:
+        MotionError: for an unknown `ground`, or if it is None and the ground is too far away for lengths in metres.
+    """
+    if ground not in (None, *GROUNDS):
+        raise MotionError(f"ground: {' or '.join(GROUNDS)} expected, got {ground!r}")
+    gap = height_above_ground(motion)
+    if gap is None:
         return motion
-    lowest = np.percentile(np.min(gaps, axis=0), 1)
-    return motion.shifted(np.array([0.0, 0.0, -lowest], np.float32))
+    where = f"the lowest sole is {abs(gap):.2f} m {'above' if gap > 0 else 'below'} the ground"
+    if abs(gap) > _FARTHEST and ground is None:
+        raise MotionError(f"{where}: are lengths in the unit that was taken? Give unit, in m, or ground=shift")
+    noted = abs(gap) > _SLACK
+    if ground == "keep":
+        return replace(motion, notes=(*motion.notes, f"{where}, and kept there")) if noted else motion
+    if ground is None and abs(gap) <= slack:
+        return motion
+    notes = (f"shifted by {-gap:+.2f} m onto the ground; ground=keep does not",) if noted else ()
+    return replace(stand_on_ground(motion), notes=(*motion.notes, *notes))

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from hdmi.assets import g1
 from hdmi.motion.check import MotionError
-from hdmi.motion.human import HumanMotion
+from hdmi.motion.human import SMPL_JOINTS, HumanMotion
 from hdmi.motion.kinematics import forward_kinematics
 from hdmi.motion.skeleton import UPRIGHT
 
@@ -102,7 +102,9 @@ def read_body(human: HumanMotion, cutoff: float) -> Body:
     """
     missing = [name for name in _REQUIRED if name not in human.joint_names]
     if missing:
-        raise MotionError(f"motion {human.name!r}: retargeting needs the joints {missing}")
+        others = ", ".join(name for name in human.joint_names if name not in SMPL_JOINTS)
+        hint = f"; of joints with other names it has {others} (names=FILE maps a BVH's)" if others else ""
+        raise MotionError(f"motion {human.name!r}: retargeting needs the joints {missing}{hint}")
     smooth = low_pass(human.joint_pos.astype(float), human.fps, cutoff)
     pos = {name: smooth[:, i] for i, name in enumerate(human.joint_names)}
     quat = {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ class RetargetReport:
     penetration: dict[str, dict[str, float]]  # into floor, object and itself: p99 and max, m
     joint_speed: float  # largest, in shares of the joint's limit
     jerk: float  # root mean square of the joints', rad/s^3
+    notes: list[str] = field(default_factory=list)  # of the source's reader: what it changed, or could not use
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for json."""
@@ -64,7 +65,7 @@ class RetargetReport:
             rest.add_row(f"penetration: {name}", _statistics(figures, 100, "cm"))
         rest.add_row("fastest joint", f"{100 * self.joint_speed:.0f} % of its limit")
         rest.add_row("joint jerk", f"{self.jerk:.0f} rad/s^3 rms")
-        return Group(title, bodies, rest)
+        return Group(title, bodies, rest, *(f"note: {note}" for note in self.notes))
 
     def save(self, path: str | Path) -> Path:
         """Writes the report as json."""

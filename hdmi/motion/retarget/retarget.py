@@ -20,6 +20,7 @@ from hdmi.assets import Effector, ObjectConfig, default_joint_pos, g1
 from hdmi.assets.robot import per_joint
 from hdmi.motion import ik
 from hdmi.motion.check import MotionError
+from hdmi.motion.files import reading
 from hdmi.motion.human import HumanMotion, ObjectTrajectory
 from hdmi.motion.kinematics import forward_kinematics
 from hdmi.motion.motion import Motion, motion_from_poses
@@ -38,6 +39,7 @@ from hdmi.motion.retarget.body import (
 from hdmi.motion.retarget.feet import FootPaths, find_stances, foot_paths, slide
 from hdmi.motion.retarget.interaction import handled_point, obstacles, on_object, scale_object
 from hdmi.motion.retarget.report import RetargetReport, statistics
+from hdmi.motion.skeleton import grounded
 
 # Weights per m and per rad. What touches the world counts most, then hands, pelvis and trunk; knees and elbows
 # only choose among the solutions that this leaves.
@@ -57,12 +59,15 @@ class RetargetOptions:
         fps: of the result.
         cutoff: what is faster in the person's motion is taken for noise, Hz.
         scale: of the scene; None: the length of the robot's legs over that of the person's.
+        ground: `shift` the person vertically until the lowest sole touches the ground, `keep` the height, or None:
+            shift if the sole misses the ground by more than 5 cm.
         ik: of the inverse kinematics; by default it keeps the robot out of floor, object and itself.
     """
 
     fps: float = 50.0
     cutoff: float = 6.0
     scale: float | None = None
+    ground: str | None = None
     ik: ik.IkOptions = field(default_factory=lambda: ik.IkOptions(floor=0.0, smoothing=SMOOTHING))
 
 
@@ -77,7 +82,7 @@ def retarget(
     """Makes a reference of the robot from a person's motion.
 
     Args:
-        human: z up, standing on the ground; its object's trajectory in the person's scene.
+        human: z up; its object's trajectory in the person's scene.
         object: what the object is; without it, it is carried over by its path alone, and neither hands nor
             collisions know it.
         effectors: of the task; the result gets a column of contact labels for each, if the source has labels.
@@ -89,10 +94,11 @@ def retarget(
 
     Raises:
         ImportError: if the extra is not installed.
-        MotionError: if the motion lacks joints, or its object.
+        MotionError: if the motion lacks joints, its object, or the ground.
     """
     options = options or RetargetOptions()
-    human = human.resample(options.fps)
+    with reading(f"motion {human.name!r}"):
+        human = grounded(human, options.ground).resample(options.fps)
     if object is not None and human.object is None:
         raise MotionError(
             f"motion {human.name!r}: has no object poses, so {object.name!r} cannot be placed; retarget it without the "
@@ -129,7 +135,7 @@ def retarget(
     )
     seconds = time.process_time() - started
     motion = _motion(human, object, scaled, effectors, result)
-    return motion, _report(motion, result, feet, human.height, scaling.scale, seconds)
+    return motion, _report(motion, result, feet, human, scaling.scale, seconds)
 
 
 def _smooth_object(thing: ObjectTrajectory, options: RetargetOptions) -> ObjectTrajectory:
@@ -213,7 +219,7 @@ def _contact(human: HumanMotion, effectors: Sequence[Effector]) -> np.ndarray | 
 
 
 def _report(
-    motion: Motion, result: ik.IkResult, feet: FootPaths, height: float, scale: float, seconds: float
+    motion: Motion, result: ik.IkResult, feet: FootPaths, human: HumanMotion, scale: float, seconds: float
 ) -> RetargetReport:
     robot = len(g1.BODY_NAMES)
     speeds = slide(
@@ -226,7 +232,7 @@ def _report(
         name=motion.name,
         frames=motion.num_frames,
         fps=motion.fps,
-        height=height,
+        height=human.height,
         scale=scale,
         milliseconds=1000 * seconds / motion.num_frames,
         iterations=float(result.iterations.mean()),
@@ -245,4 +251,5 @@ def _report(
         },
         joint_speed=float((np.abs(steps) / limits).max()),
         jerk=float(np.sqrt((jerk**2).mean())) if len(jerk) else 0.0,
+        notes=list(human.notes),
     )

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Unpack
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,27 +13,16 @@ from scipy.spatial.transform import Rotation
 from hdmi.motion.check import MotionError
 from hdmi.motion.files import read_text, reading
 from hdmi.motion.human import SMPL_JOINTS, SMPL_PARENTS, HumanMotion
-from hdmi.motion.skeleton import anthropometric_skeleton, height_from_legs, z_up, z_up_quat
+from hdmi.motion.skeleton import anthropometric_skeleton, height_from_legs
+from hdmi.motion.sources.joint_names import read_names, smpl_names
+from hdmi.motion.sources.world import World, checked_height, fps_of, placed, unit_of, without_blank_ends
 
+ANGLES = ("degrees", "radians")
 _CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 _MAX_JOINTS = 1000
-
-
-def _sided(**names: str) -> dict[str, str]:
-    return {f"{side}{theirs}": f"{side.lower()}_{ours}" for theirs, ours in names.items() for side in ("Left", "Right")}
-
-
-_TRUNK = {"Hips": "pelvis", "Spine": "spine1", "Spine1": "spine2", "Spine2": "spine3", "Neck": "neck", "Head": "head"}
-# LAFAN1, Mixamo, CMU: the arm hangs from a shoulder
-_ARM_NAMES = _TRUNK | _sided(
-    UpLeg="hip", Leg="knee", Foot="ankle", Toe="foot", ToeBase="foot",
-    Shoulder="collar", Arm="shoulder", ForeArm="elbow", Hand="wrist",
-)  # fmt: skip
-# others name the joints: the shoulder hangs from a collar
-_JOINT_NAMES = _TRUNK | {"Chest": "spine1", "Chest2": "spine2", "Chest3": "spine3"} | _sided(
-    Hip="hip", Knee="knee", Ankle="ankle", Toe="foot",
-    Collar="collar", Shoulder="shoulder", Elbow="elbow", Wrist="wrist",
-)  # fmt: skip
+_MOTION = re.compile(r"(?<!\S)MOTION\s+Frames\s*:\s*(\S+)\s+Frame\s*Time\s*:\s*(\S+)", re.IGNORECASE)
+# A file in which nothing turns by a full turn of radians, but so many channels by 45 deg if it is in radians
+_TURNED, _TURNS = 0.8, 4
 
 
 @dataclass
@@ -44,43 +34,62 @@ class _Joint:
 
 
 def read_bvh(
-    path: str | Path, height: float | None = None, *, unit: float = 0.01, up: Literal["y", "z"] = "y"
+    path: str | Path,
+    height: float | None = None,
+    fps: float | None = None,
+    names: str | Path | None = None,
+    angles: str | None = None,
+    **world: Unpack[World],
 ) -> HumanMotion:
-    """A motion from a BVH file.
+    """A motion from a BVH file, in centimetres and with y up unless `world` says otherwise.
 
-    Joints with a name that LAFAN1, Mixamo, CMU or Vicon files use get SMPL's, others keep theirs. Orientations are
-    kept where the file's rest pose is a T-pose, as SMPL's is (LAFAN1's is none).
+    Joints get SMPL's names by what exporters call them (`smpl_names`), others keep theirs. The rest pose is that of the
+    OFFSETs; a joint with position channels is where they say in each frame, and not at its OFFSET. If they are zero
+    throughout, they move it relative to that. Orientations are kept where the rest pose is a T-pose, as SMPL's is,
+    whatever its heading (LAFAN1's is none); otherwise a note says why not.
 
     Args:
         height: of the person, m; from the length of the legs if not given.
-        unit: of the file's lengths, m; centimetres unless said otherwise.
-        up: the axis of the file that points up.
+        fps: instead of the file's Frame Time.
+        names: YAML file with SMPL's names for joints, one `theirs: ours` a line.
+        angles: `degrees`, what BVH files are in, or `radians`.
+        world: see `World`.
 
     Raises:
         MotionError: if the file is not a BVH file, or its joints are not a person's.
     """
     path = Path(path)
-    head, marker, tail = read_text(path).partition("MOTION")
-    if not marker:
-        raise MotionError(f"{path}: not a BVH file: no MOTION section")
-    joints = _parse_hierarchy(path, head.split())
-    fps, values = _parse_motion(path, tail, sum(len(joint.channels) for joint in joints))
-    pos, mat = _pose(joints, values)
-    rest, _ = _pose(joints, np.zeros((1, values.shape[1])))
-    pos, rest = pos * unit, rest * unit
-    names = _smpl_names([joint.name for joint in joints])
+    text = read_text(path).lstrip("\ufeff")
+    header = _MOTION.search(text)
+    if header is None:
+        if re.search(r"(?<!\S)MOTION(?!\S)", text, re.IGNORECASE) is None:
+            raise MotionError(f"{path}: not a BVH file: no MOTION section")
+        raise MotionError(f"{path}: MOTION: 'Frames: N' and 'Frame Time: S' expected")
+    joints = _parse_hierarchy(path, text[: header.start()].split())
+    frame_time, values = _parse_motion(path, header, text[header.end() :].split(), joints)
     with reading(path):
-        if "pelvis" not in names:
-            raise MotionError(f"joint_names: no root Hips among {', '.join(joint.name for joint in joints)}")
-        legs = height_from_legs(names, pos)
-        if not 0.5 <= legs <= 2.5:
-            raise MotionError(f"the legs are those of a person of {legs:.3g} m: is unit={unit} m right?")
+        rate, notes = _rate(fps, frame_time)
+        unit = unit_of(world, 0.01)
+        kept, dropped = without_blank_ends(values)
+        pos, mat = _pose(joints, values[kept], _in_radians(joints, values, angles))
+        theirs = [joint.name for joint in joints]
+        ours = smpl_names(theirs, None if names is None else read_names(names, theirs))
+        if "pelvis" not in ours:
+            raise MotionError(f"joint_names: no root Hips among {', '.join(theirs)}: say in names=FILE which it is")
+        pos *= unit
+        known = height
+        if height is None or all(f"left_{part}" in ours for part in ("hip", "knee", "ankle")):
+            known = checked_height(height_from_legs(ours, pos), unit, world, height)
+        assert known is not None
+        rest = _rest_frame(ours, _rest_pos(joints))
         quat = None
-        if up == "y" and _rests_in_t_pose(names, rest[0]):
-            flat = Rotation.from_matrix(mat.reshape(-1, 3, 3)).as_quat(scalar_first=True)
-            quat = z_up_quat(flat.reshape(*mat.shape[:2], 4))
-        pos = z_up(pos) if up == "y" else pos
-        return HumanMotion(path.stem, fps, legs if height is None else height, names, pos, quat)
+        if isinstance(rest, str):
+            notes += (f"orientations are not used, hands and trunk are turned as positions tell: {rest}",)
+        else:
+            quat = Rotation.from_matrix((mat @ rest).reshape(-1, 3, 3)).as_quat(scalar_first=True)
+            quat = quat.reshape(*mat.shape[:2], 4)
+        motion = HumanMotion(path.stem, rate, known, ours, pos, quat, notes=notes + dropped)
+        return placed(motion, "y", unit, world)
 
 
 def _parse_hierarchy(path: Path, tokens: list[str]) -> list[_Joint]:
@@ -99,17 +108,18 @@ def _parse_hierarchy(path: Path, tokens: list[str]) -> list[_Joint]:
         return found
 
     while i < len(tokens):
-        token = tokens[i]
+        token = tokens[i].upper()
         if token in ("ROOT", "JOINT"):
             if (token == "ROOT") == bool(joints) or i + 1 >= len(tokens) or len(joints) >= _MAX_JOINTS:
                 raise MotionError(f"{path}: HIERARCHY: a single ROOT and up to {_MAX_JOINTS} named joints expected")
             parent = stack[-1] if stack else -1
             if token == "JOINT" and parent < 0:
                 raise MotionError(f"{path}: HIERARCHY: JOINT {tokens[i + 1]!r} hangs from no joint")
-            joints.append(_Joint(tokens[i + 1].rpartition(":")[2], parent))
+            words = _name(tokens[i + 1 :])
+            joints.append(_Joint(" ".join(words).rpartition(":")[2], parent))
             pending = len(joints) - 1
-            i += 2
-        elif token == "End":
+            i += 1 + len(words)
+        elif token == "END":
             pending = -1
             i += 2
         elif token == "{":
@@ -132,15 +142,21 @@ def _parse_hierarchy(path: Path, tokens: list[str]) -> list[_Joint]:
             if not stack or stack[-1] < 0 or not tokens[i + 1 : i + 2] or not tokens[i + 1].isdecimal():
                 raise MotionError(f"{path}: HIERARCHY: CHANNELS of no joint, or without their count")
             count = min(int(tokens[i + 1][:9]), len(tokens))
-            channels = tokens[i + 2 : i + 2 + count]
-            if len(channels) != count or len(set(channels)) != count or not set(channels) <= set(_CHANNELS):
-                raise MotionError(f"{path}: HIERARCHY: CHANNELS of {joints[stack[-1]].name!r}: {channels[:6]}")
+            named = tokens[i + 2 : i + 2 + count]
+            channels = [channel.capitalize() for channel in named]
+            unknown = [channel for channel in named if channel.capitalize() not in _CHANNELS]
+            if unknown or len(channels) != count or len(set(channels)) != count:
+                wrong = f"{unknown[0][:40]!r} is none" if unknown else "each at most once"
+                raise MotionError(
+                    f"{path}: HIERARCHY: CHANNELS of {joints[stack[-1]].name!r}: {tokens[i + 1][:9]} of "
+                    f"{', '.join(_CHANNELS)} expected; {wrong}"
+                )
             joints[stack[-1]].channels = channels
             i += 2 + count
         elif token == "HIERARCHY":
             i += 1
         else:
-            raise MotionError(f"{path}: HIERARCHY: unexpected {token[:40]!r}")
+            raise MotionError(f"{path}: HIERARCHY: unexpected {tokens[i][:40]!r}")
     if not joints or stack:
         raise MotionError(f"{path}: HIERARCHY: {'unbalanced braces' if stack else 'no ROOT'}")
     for joint in joints:
@@ -149,48 +165,98 @@ def _parse_hierarchy(path: Path, tokens: list[str]) -> list[_Joint]:
     return joints
 
 
-def _parse_motion(path: Path, text: str, width: int) -> tuple[float, np.ndarray]:
-    tokens = text.split()
-    labels, times = [tokens[i : i + n] for i, n in ((0, 1), (2, 2))], (tokens[1:2], tokens[4:5])
+def _name(tokens: list[str]) -> list[str]:
+    """The words of a joint's name: up to the brace, if there is one soon."""
+    words = tokens[: tokens.index("{")] if "{" in tokens[1:5] else tokens[:1]
+    return words or tokens[:1]
+
+
+def _parse_motion(
+    path: Path, header: re.Match[str], tokens: list[str], joints: list[_Joint]
+) -> tuple[float, np.ndarray]:
+    """Frame Time and channels [T, C]."""
+    width = sum(len(joint.channels) for joint in joints)
     try:
-        if labels != [["Frames:"], ["Frame", "Time:"]]:
-            raise ValueError("'Frames: N' and 'Frame Time: S' expected")
-        num_frames, frame_time = int(times[0][0]), float(times[1][0])
-        values = np.array(tokens[5:], dtype=float)
-    except (ValueError, IndexError) as error:
-        raise MotionError(f"{path}: MOTION: {str(error).splitlines()[0][:120]}") from error
-    if not 1e-3 <= frame_time <= 1:
-        raise MotionError(f"{path}: MOTION: Frame Time must be from 0.001 to 1 s, got {frame_time}")
+        num_frames, frame_time = int(header[1]), float(header[2])
+    except ValueError as error:
+        raise MotionError(f"{path}: MOTION: Frames or Frame Time: {_shortened(error)}") from error
+    try:
+        values = np.array(tokens, dtype=float)
+    except ValueError as error:
+        bad = next((i for i, token in enumerate(tokens) if not _is_number(token)), 0)
+        where = f" at frame {bad // width}, channel {bad % width}" if width else ""
+        raise MotionError(f"{path}: MOTION: {_shortened(error)}{where}") from error
     if not width or num_frames < 2 or values.size != num_frames * width:
         raise MotionError(
             f"{path}: MOTION: {values.size} numbers for {num_frames} frames of {width} channels; needs 2 frames"
         )
     values = values.reshape(num_frames, width)
-    if (bad := np.argwhere(~(np.abs(values) < 1e9))).size:
-        raise MotionError(f"{path}: MOTION: {values[tuple(bad[0])]} at frame {bad[0][0]}, channel {bad[0][1]}")
+    if (bad_values := np.argwhere(~(np.abs(values) < 1e9))).size:
+        frame, channel = bad_values[0]
+        raise MotionError(f"{path}: MOTION: {values[frame, channel]} at frame {frame}, channel {channel}")
+    return frame_time, values
+
+
+def _shortened(error: Exception) -> str:
+    text = str(error).splitlines()[0][:120]
+    return f"{text}: a decimal point expected" if re.search(r"\d,\d", text) else text
+
+
+def _is_number(token: str) -> bool:
+    try:
+        float(token)
+    except ValueError:
+        return False
+    return True
+
+
+def _rate(given: float | None, frame_time: float) -> tuple[float, tuple[str, ...]]:
+    if not 1e-3 <= frame_time <= 1:
+        if given is None:
+            raise MotionError(
+                f"MOTION: Frame Time must be from 0.001 to 1 s, got {frame_time}; give source_fps, frames per second"
+            )
+        return fps_of(given, None, "Frame Time")
     fps = 1.0 / frame_time
-    return float(round(fps)) if abs(fps - round(fps)) < 1e-3 * fps else fps, values
+    return fps_of(given, float(round(fps)) if abs(fps - round(fps)) < 1e-3 * fps else fps, "its Frame Time")
 
 
-def _pose(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _in_radians(joints: list[_Joint], values: np.ndarray, angles: str | None) -> bool:
+    if angles not in (None, *ANGLES):
+        raise MotionError(f"angles: {' or '.join(ANGLES)} expected, got {angles!r}")
+    # the root may have turned around several times
+    inner = [joint.parent >= 0 and channel.endswith("rotation") for joint in joints for channel in joint.channels]
+    largest = np.abs(values[:, inner]).max(0, initial=0.0)
+    if angles is None and largest.max(initial=0.0) <= 2 * np.pi and (largest > _TURNED).sum() >= _TURNS:
+        raise MotionError(
+            f"MOTION: no joint turns by more than {largest.max():.2f}: are angles in radians? Give angles=radians, or "
+            "angles=degrees"
+        )
+    return angles == "radians"
+
+
+def _pose(joints: list[_Joint], values: np.ndarray, radians: bool) -> tuple[np.ndarray, np.ndarray]:
     """Positions [T, J, 3] in the file's unit, and orientations [T, J, 3, 3]."""
     num_frames = len(values)
     pos, mat = np.zeros((num_frames, len(joints), 3)), np.zeros((num_frames, len(joints), 3, 3))
+    relative = _moves_from_offset(joints, values)
     column = 0
     for j, joint in enumerate(joints):
         local = np.tile(np.asarray(joint.offset, dtype=float), (num_frames, 1))
         order, angles = "", []
         for channel in joint.channels:
             axis, kind = channel[0], channel[1:]
-            if kind == "position":  # takes the place of the offset
-                local[:, "XYZ".index(axis)] = values[:, column]
-            else:
+            if kind == "rotation":
                 order += axis
                 angles.append(values[:, column])
+            elif relative and joint.parent >= 0:
+                local[:, "XYZ".index(axis)] += values[:, column]
+            else:  # takes the place of the offset
+                local[:, "XYZ".index(axis)] = values[:, column]
             column += 1
         turn = np.tile(np.eye(3), (num_frames, 1, 1))
         for axis, angle in zip(order, angles, strict=True):
-            turn = turn @ Rotation.from_euler(axis.lower(), angle[:, None], degrees=True).as_matrix()
+            turn = turn @ Rotation.from_euler(axis.lower(), angle[:, None], degrees=not radians).as_matrix()
         if joint.parent < 0:
             pos[:, j], mat[:, j] = local, turn
         else:
@@ -199,25 +265,43 @@ def _pose(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.ndar
     return pos, mat
 
 
-def _smpl_names(theirs: list[str]) -> tuple[str, ...]:
-    table = _ARM_NAMES if {"LeftArm", "LeftUpLeg"} & set(theirs) else _JOINT_NAMES
-    ours: list[str] = []
-    for name in theirs:
-        mapped = table.get(name, name)
-        ours.append(name if mapped in ours else mapped)
-    return tuple(ours)
+def _moves_from_offset(joints: list[_Joint], values: np.ndarray) -> bool:
+    """Whether position channels of joints below the root are zero throughout, though their offsets are not."""
+    inner = [joint.parent >= 0 and channel.endswith("position") for joint in joints for channel in joint.channels]
+    return any(inner) and not values[:, inner].any()
 
 
-def _rests_in_t_pose(names: tuple[str, ...], rest: np.ndarray) -> bool:
-    """Whether limbs point where SMPL's do at rest, to within 25 degrees."""
-    offset = anthropometric_skeleton(1.7).offset
-    for j, (name, parent) in enumerate(zip(SMPL_JOINTS, SMPL_PARENTS, strict=True)):
-        if name.partition("_")[2] in ("knee", "ankle", "elbow", "wrist"):
-            other = SMPL_JOINTS[parent]
-            if name not in names or other not in names:
-                return False
-            bone = rest[names.index(name)] - rest[names.index(other)]
-            lengths = np.linalg.norm(bone) * np.linalg.norm(offset[j])
-            if bone @ offset[j] < np.cos(np.radians(25)) * lengths or not lengths:
-                return False
-    return True
+def _rest_pos(joints: list[_Joint]) -> np.ndarray:
+    """Where joints are if nothing is turned, in the file's unit. [J, 3]"""
+    rest = np.array([joint.offset for joint in joints], dtype=float)
+    for j, joint in enumerate(joints):
+        if joint.parent >= 0:
+            rest[j] += rest[joint.parent]
+    return rest
+
+
+def _rest_frame(names: tuple[str, ...], rest: np.ndarray) -> np.ndarray | str:
+    """SMPL's axes, x to the left, y up and z forward, of a T-pose along the file's axes; or why it is none. [3, 3]
+
+    Limbs have to point where SMPL's do at rest, to within 25 degrees.
+    """
+    parents = {joint: SMPL_JOINTS[parent] for joint, parent in zip(SMPL_JOINTS[1:], SMPL_PARENTS[1:], strict=True)}
+    limbs = [joint for joint in parents if joint.partition("_")[2] in ("knee", "ankle", "elbow", "wrist")]
+    if missing := sorted(({*limbs} | {parents[joint] for joint in limbs}) - set(names)):
+        return f"the file lacks {', '.join(missing)}"
+    bones = {joint: rest[names.index(joint)] - rest[names.index(parents[joint])] for joint in limbs}
+    left, up = bones["left_elbow"] - bones["right_elbow"], -bones["left_knee"] - bones["right_knee"]
+    axes = np.zeros((2, 3))
+    for axis, direction in zip(axes, (left, up), strict=True):
+        i = int(np.abs(direction).argmax())
+        axis[i] = np.sign(direction[i])
+    frame = np.stack([axes[0], axes[1], np.cross(*axes)], axis=-1)
+    skeleton = anthropometric_skeleton(1.7)
+    for joint, bone in bones.items():
+        offset = skeleton.offset[skeleton.index(joint)]
+        lengths = np.linalg.norm(bone) * np.linalg.norm(offset)
+        if not lengths:
+            return f"in its rest pose {joint} is where {parents[joint]} is"
+        if not bone @ frame @ offset >= np.cos(np.radians(25)) * lengths:
+            return f"its rest pose is no T-pose (from {parents[joint]} to {joint})"
+    return frame

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,6 +14,7 @@ from hdmi.motion.check import MotionError, checked, checked_quat
 from hdmi.motion.files import read_npz, read_torch, reading, tensor_array
 from hdmi.motion.human import SMPL_JOINTS, SMPL_PARENTS, HumanMotion, ObjectTrajectory
 from hdmi.motion.skeleton import UPRIGHT, Skeleton, height_from_legs, pose_skeleton
+from hdmi.motion.sources.world import World, checked_height, fps_of, placed, unit_of, without_blank_ends
 
 _FPS = 30.0  # of both
 
@@ -33,7 +35,7 @@ _BODIES = len(_INTERMIMIC_JOINTS)  # 52
 _WIDTH = 331 + 5 * _BODIES  # 591 columns
 
 
-def read_omomo(path: str | Path) -> HumanMotion:
+def read_omomo(path: str | Path, fps: float | None = None, **world: Unpack[World]) -> HumanMotion:
     """One sequence of OMOMO, z up at 30 fps, as an npz with the field names of OMOMO's pickle.
 
     The pickle itself is refused, like every pickle; docs/motions.md shows how to export one that you trust. Joints
@@ -41,6 +43,10 @@ def read_omomo(path: str | Path) -> HumanMotion:
 
     Reads seq_name, trans [T, 3] (of the pelvis), root_orient [T, 3], pose_body [T, 63], rest_offsets [22 or 24, 3],
     obj_trans [T, 3] or [T, 3, 1], obj_rot [T, 3, 3].
+
+    Args:
+        fps: instead of OMOMO's.
+        world: see `World`.
 
     Raises:
         MotionError: if the file is not such a sequence.
@@ -74,23 +80,31 @@ def read_omomo(path: str | Path) -> HumanMotion:
     offsets[0] = 0.0
     names, parents = _OMOMO_JOINTS[:count], _OMOMO_PARENTS[:count]
     with reading(path):
-        skeleton = Skeleton(names, parents, offsets, height=np.nan)
+        unit = unit_of(world, 1.0)
+        skeleton = Skeleton(names, parents, offsets * unit, height=np.nan)
         rest, _ = skeleton.forward(np.zeros((1, count, 3)), np.zeros((1, 3)))
-        skeleton = replace(skeleton, height=height_from_legs(names, rest))
-        motion = pose_skeleton(name, skeleton, rotation, trans, _FPS, y_up=False)
+        skeleton = replace(skeleton, height=checked_height(height_from_legs(names, rest), unit, world, None))
+        rate, notes = fps_of(fps, _FPS, "OMOMO")
+        kept, dropped = without_blank_ends(np.concatenate([root, body, trans], axis=1))
+        motion = pose_skeleton(name, skeleton, rotation[kept], trans[kept] * unit, rate, y_up=False)
         quat = Rotation.from_matrix(obj_rot).as_quat(scalar_first=True)
-        return replace(motion, object=ObjectTrajectory(_object_of(name), obj_pos, quat))
+        thing = ObjectTrajectory(_object_of(name), obj_pos[kept] * unit, quat[kept])
+        return placed(replace(motion, object=thing, notes=notes + dropped), "z", unit, world)
 
 
-def read_intermimic(path: str | Path, height: float | None = None) -> HumanMotion:
+def read_intermimic(
+    path: str | Path, height: float | None = None, fps: float | None = None, **world: Unpack[World]
+) -> HumanMotion:
     """One sequence of InterMimic: a tensor of 591 columns, z up at 30 fps.
 
     Columns: root 0-7, joints 9-162, body positions 162-318, object pose 318-325 (xyzw), contact of the object 330 and
     of the 52 bodies 331-383 (1 touches, -1 must not), body orientations 383-591 (xyzw). Contacts of fingers count as
-    their wrist's.
+    their wrist's. Blank frames at start and end, which the project's own retargeted sequences have, are dropped.
 
     Args:
         height: of the person, m; from the length of the legs if not given.
+        fps: instead of InterMimic's.
+        world: see `World`.
 
     Raises:
         MotionError: if the file is not such a sequence.
@@ -105,9 +119,14 @@ def read_intermimic(path: str | Path, height: float | None = None) -> HumanMotio
     if num_frames < 2:
         raise MotionError(f"{path}: tensor: needs at least 2 frames, has {num_frames}")
     data = checked(path, "tensor", data, data.shape)
-    pos = data[:, 162:318].reshape(num_frames, _BODIES, 3)
-    quat = _wxyz(data[:, 383:].reshape(num_frames, _BODIES, 4))
-    quat = checked_quat(path, "columns 383-591", quat, _INTERMIMIC_JOINTS, "body")
+    quat, obj_quat = _wxyz(data[:, 383:].reshape(num_frames, _BODIES, 4)), _wxyz(data[:, None, 321:325])
+    kept, dropped = without_blank_ends(np.concatenate([data[:, 162:318], data[:, 383:]], axis=1))
+    ends = np.ones(num_frames, bool)
+    ends[kept] = False  # checked as the identity and dropped afterwards, so that messages have the file's frames
+    quat[ends], obj_quat[ends] = [1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
+    quat = checked_quat(path, "columns 383-591", quat, _INTERMIMIC_JOINTS, "body")[kept]
+    obj_quat = checked_quat(path, "columns 321-325", obj_quat, ["object"], "object")[kept, 0]
+    data = data[kept]
     # its bodies rest with x forward, y left and z up
     turned = Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True) * UPRIGHT
     quat = turned.as_quat(scalar_first=True).reshape(quat.shape)
@@ -115,18 +134,22 @@ def read_intermimic(path: str | Path, height: float | None = None) -> HumanMotio
     names = tuple(name for name in _INTERMIMIC_JOINTS if name in SMPL_JOINTS)
     contact = np.stack([touching[:, _contact_columns(name)].any(1) for name in names], axis=1)
     with reading(path):
-        obj_quat = checked_quat(path, "columns 321-325", _wxyz(data[:, None, 321:325]), ["object"], "object")[:, 0]
-        return HumanMotion(
+        unit = unit_of(world, 1.0)
+        pos = data[:, 162:318].reshape(-1, _BODIES, 3) * unit
+        rate, notes = fps_of(fps, _FPS, "InterMimic")
+        motion = HumanMotion(
             path.stem,
-            _FPS,
-            height_from_legs(_INTERMIMIC_JOINTS, pos) if height is None else height,
+            rate,
+            checked_height(height_from_legs(_INTERMIMIC_JOINTS, pos), unit, world, height),
             _INTERMIMIC_JOINTS,
             pos,
             quat,
-            ObjectTrajectory(_object_of(path.stem), data[:, 318:321], obj_quat),
+            ObjectTrajectory(_object_of(path.stem), data[:, 318:321] * unit, obj_quat),
             contact,
             names,
+            notes + dropped,
         )
+        return placed(motion, "z", unit, world)
 
 
 def _contact_columns(joint: str) -> list[int]:
