@@ -30,7 +30,7 @@ REST_POINT = (0.1, 0.0, 0.0)  # of a hand that is no end effector of the task
 FOOT_WEIGHT = (50.0, 20.0)
 COM_WEIGHT, PELVIS_WEIGHT, HAND_WEIGHT = 10.0, (2.0, 0.5), (10.0, 3.0)
 TORSO_WEIGHT = 1.0
-HELD_WEIGHT, HELD_HAND_WEIGHT = 30.0, 0.1  # of joints that hold the default pose; of hands' orientations beyond these
+HELD_WEIGHT = 30.0  # of joints that hold the default pose
 LEG_POSTURE_WEIGHT = 0.02
 LIMIT_MARGIN = 0.06  # rad
 MAX_MISS = {"hand": 0.03, "foot": 0.01}  # m; beyond, a plan is out of reach
@@ -268,7 +268,7 @@ def _hand_targets(
     contact = np.zeros((len(time), len(effectors)), bool)
     targets: list[ik.Target] = []
     rest = _rest_pose(paths, body)
-    turning = HELD_HAND_WEIGHT if any("wrist" in name for name in robot.held_joints) else HAND_WEIGHT[1]
+    turning = plan.turning if any("wrist" in name for name in robot.held_joints) else HAND_WEIGHT[1]
     for side, name in HANDS.items():
         effector = next((e for e in effectors if e.body == name), None)
         own = REST_POINT if effector is None else tuple(effector.point)

@@ -21,6 +21,7 @@ from the key before it; between keys everything moves with minimum jerk and rest
 | scenery    | `{name: {pos, rpy}}`                                                                                |
 | posture    | joint name pattern -> rad: what free joints tend to, where it is not the default pose               |
 | arm_posture| weight of the arms' posture, per rad (a hand has 10 per m): less lets elbows follow further          |
+| turning    | weight of the hands' orientations, per rad, where the task's robot holds its wrists             |
 | corrections| rounds that move the centre of mass until the centre of pressure, dynamics included, is as planned  |
 
 A pose key: `{at, frame, pos, rpy, point, out, gap, contact, rest, attach}`. `pos` and `rpy` are in `frame`: `world`,
@@ -134,6 +135,7 @@ class Plan:
     scenery: Mapping[str, PoseKey] = field(default_factory=dict)
     posture: Mapping[str, float] = field(default_factory=dict)
     arm_posture: float = 0.05
+    turning: float = 0.1
     corrections: int = 2
 
 
@@ -217,7 +219,7 @@ def parse_plan(content: Any, file: Path) -> Plan:
     root = _Node(content, f"{file}: ", {})
     root.only(
         "duration", "phases", "start", "feet", "heels", "pelvis", "torso", "hands", "object", "push", "balance",
-        "scenery", "posture", "arm_posture", "corrections",
+        "scenery", "posture", "arm_posture", "turning", "corrections",
     )  # fmt: skip
     phases = root.node("phases")
     root.phases = {str(name): phases.number(name) for name in phases.value}
@@ -260,6 +262,7 @@ def parse_plan(content: Any, file: Path) -> Plan:
         scenery=placed,
         posture={str(pattern): posture.number(pattern) for pattern in posture.value},
         arm_posture=root.number("arm_posture", 0.05),
+        turning=root.number("turning", 0.1),
         corrections=int(root.number("corrections", 2)),
     )
 
