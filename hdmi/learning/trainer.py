@@ -403,7 +403,9 @@ class Trainer:
             self.averaged.module.load_state_dict(state["actor"])
             self.critic.load_state_dict(state["critic"])
         except RuntimeError as error:
-            raise CheckpointError("resume: the networks of the checkpoint are not those of the config's algo") from error
+            raise CheckpointError(
+                "resume: the networks of the checkpoint are not those of the config's algo"
+            ) from error
         self.actor_optim.load_state_dict(state["actor_optim"])
         self.critic_optim.load_state_dict(state["critic_optim"])
         self.iteration, self.frames, self.elapsed = state["iteration"], state["frames"], state["elapsed"]
