@@ -6,10 +6,10 @@
 `checkpoint` is a run folder (its newest checkpoint counts) or a checkpoint file. `terminations` are those that end
 an episode as a failure: `all` that the policy was trained with, `none`, or a list such as
 [root_pose,object_pose]; `without` takes some of them away: without=[lost_contact] is the paper's evaluation of the
-interaction reward, on every task with contacts, without=[body_local_pose] that of the residual action. Errors are means
-over the steps survived, and as `..._horizon` over the whole motion, in which the world goes on after a failure. An agent
-instead of a checkpoint shows what a task is without a policy, in the environment of
-the default config. Its figures, and those of an exported policy, are written only where `out` says.
+interaction reward, on every task with contacts, without=[body_local_pose] that of the residual action. Errors are
+means over the steps survived, and as `..._horizon` over the whole motion, in which the world goes on after a failure.
+An agent instead of a checkpoint shows what a task is without a policy, in the environment of the default config. Its
+figures, and those of an exported policy, are written only where `out` says.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ class _ValueHead(_Network):
 class _GaussianHead(_Network):
     """Mean from the network, standard deviation a free parameter per action, within bounds.
 
-    Beyond a bound its gradient is the bound's, so that it can come back; `bound` keeps it from moving away.
+    Beyond a bound its gradient is the bound's, so that it can come back; `bound_noise` keeps it from moving away.
     """
 
     def __init__(self, in_size: int, out_size: int, init_noise: float, **kwargs: Any):
@@ -96,16 +96,12 @@ class _GaussianHead(_Network):
 
     def forward_normalised(self, normalised: Tensor) -> tuple[Tensor, Tensor]:
         loc = super().forward_normalised(normalised)
-        within = self.log_std + (self._bounded() - self.log_std).detach()
+        within = self.log_std + (self.bounded() - self.log_std).detach()
         return loc, within.exp().expand_as(loc)
 
-    def _bounded(self) -> Tensor:
+    def bounded(self) -> Tensor:
+        """The parameter, or the bound that it has crossed."""
         return self.log_std.clamp(math.log(_MIN_STD), math.log(_MAX_STD))
-
-    @torch.no_grad()
-    def bound(self) -> None:
-        """Puts the parameter back to the bound that it has crossed; to call after an optimizer's step."""
-        self.log_std.copy_(self._bounded())
 
 
 def make_actor(
@@ -147,6 +143,17 @@ class _AfterNorm(nn.Module):
 def network_of(module: nn.Module) -> _Network:
     """The network of an actor or critic."""
     return next(m for m in module.modules() if isinstance(m, _Network))
+
+
+@torch.no_grad()
+def bound_noise(actor: nn.Module) -> None:
+    """Puts parameters of an actor's standard deviations back to the bound that they have crossed.
+
+    To call after an optimizer's step.
+    """
+    for head in actor.modules():
+        if isinstance(head, _GaussianHead):
+            head.log_std.copy_(head.bounded())
 
 
 def normalised_networks(actor: nn.Module, critic: nn.Module) -> tuple[ProbabilisticActor, ValueOperator]:

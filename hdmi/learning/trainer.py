@@ -28,7 +28,7 @@ from hdmi.console import make_console
 from hdmi.learning.checkpoint import CheckpointError, claim, load_checkpoint, rotate, save_checkpoint, supersede
 from hdmi.learning.distributed import Ranks
 from hdmi.learning.logger import RunLogger
-from hdmi.learning.networks import network_of, normalised_networks
+from hdmi.learning.networks import bound_noise, network_of, normalised_networks
 from hdmi.learning.policy import make_networks
 from hdmi.learning.resume import CONFIG_FILE, problem_changes
 from hdmi.motion import find_motion
@@ -226,7 +226,7 @@ class Trainer:
         self.bad_updates = 0
         self.actor_optim.step()
         self.critic_optim.step()
-        network_of(self.actor).bound()
+        bound_noise(self.actor)
         row = dict(zip(figures, values, strict=True))
         self.schedule.step(row["kl"])
         return row
@@ -368,8 +368,8 @@ class Trainer:
         self._changed = problem_changes(state["config"], config)
         if self._changed and not self.cfg.resume_anyway:
             raise CheckpointError(
-                f"resume: {', '.join(self._changed)}: not as in the run, which would go on as another experiment; leave "
-                "that out, begin a new run, or say resume_anyway=true to keep the networks only and begin new episodes"
+                f"resume: {', '.join(self._changed)}: not as in the run, which would be another experiment; leave that "
+                "out, begin a new run, or say resume_anyway=true: networks and optimizers continue, in new episodes"
             )
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -387,8 +387,8 @@ class Trainer:
             )
         if state.get("motion", self.motion_digest) != self.motion_digest and not self.cfg.resume_anyway:
             raise CheckpointError(
-                f"resume: the motion {self.cfg.task.motion!r} is not the one of the run; set motion_root=FOLDER to where "
-                "that is, or say resume_anyway=true"
+                f"resume: the motion {self.cfg.task.motion!r} is not the one of the run; set motion_root=FOLDER to "
+                "where that is, or say resume_anyway=true"
             )
         if state["sizes"] != self.sizes:
             raise CheckpointError(f"resume: the checkpoint has sizes {state['sizes']}, the config {self.sizes}")
@@ -403,9 +403,7 @@ class Trainer:
             self.averaged.module.load_state_dict(state["actor"])
             self.critic.load_state_dict(state["critic"])
         except RuntimeError as error:
-            raise CheckpointError(
-                "resume: the networks of the checkpoint are not those of the config's algo"
-            ) from error
+            raise CheckpointError("resume: the checkpoint's networks are not those of the config's algo") from error
         self.actor_optim.load_state_dict(state["actor_optim"])
         self.critic_optim.load_state_dict(state["critic_optim"])
         self.iteration, self.frames, self.elapsed = state["iteration"], state["frames"], state["elapsed"]
