@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import signal
 import sys
+import threading
 import time
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -234,9 +237,10 @@ class Trainer:
     # -- the loop ---------------------------------------------------------------------------------------------
 
     def run(self, finish: Callable[[RunLogger], None] | None = None) -> None:
-        """Trains up to `cfg.total_frames`; an interrupt leaves a checkpoint to resume from.
+        """Trains up to `cfg.total_frames`; an interrupt ends it after the iteration, with a checkpoint to resume from.
 
-        Of several ranks the first one logs and writes; interrupted, they leave the last periodic checkpoint.
+        A second interrupt does not wait: what was collected for that iteration is then lost to the continued run. Of
+        several ranks the first one logs and writes; interrupted, they leave the last periodic checkpoint.
         Checkpoints of the folder that are newer than where the run continues are set aside in `superseded`.
 
         Args:
@@ -272,7 +276,10 @@ class Trainer:
         console = make_console()
         visible = first and console.is_terminal
         try:
-            with Progress(*columns, console=console, refresh_per_second=2, disable=not visible) as progress:
+            with (
+                _deferred_interrupt(self.ranks.size == 1) as interrupted,
+                Progress(*columns, console=console, refresh_per_second=2, disable=not visible) as progress,
+            ):
                 frames_per_iteration = self.frames_per_batch * self.ranks.size
                 total = -(-cfg.total_frames // frames_per_iteration)
                 bar = progress.add_task(self.task.name, total=total, completed=self.iteration, numbers="")
@@ -302,6 +309,8 @@ class Trainer:
                         console.print(f"{self.iteration}/{total} {_headline(row)}", highlight=False)
                     if self.iteration % cfg.checkpoint_interval == 0:
                         self.save()
+                    if interrupted():
+                        raise KeyboardInterrupt
                 if self.ranks.size > 1:
                     self.save()
         finally:
@@ -411,6 +420,33 @@ class Trainer:
         if not self._changed:
             self.collector.load_state_dict(own)
         torch.set_rng_state(own["rng"].cpu())
+
+
+@contextmanager
+def _deferred_interrupt(wanted: bool) -> Iterator[Callable[[], bool]]:
+    """Notes a first Ctrl-C, for the caller to ask for, and passes on a second one.
+
+    Args:
+        wanted: whether to do so; it is not done either where interrupts are handled otherwise.
+    """
+    came = False
+
+    def note(number: int, frame: Any) -> None:
+        nonlocal came
+        if came:
+            raise KeyboardInterrupt
+        came = True
+        os.write(2, b"interrupted: ends after this iteration; once more ends it at once\n")  # print is not reentrant
+
+    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not wanted or not usual or threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: came
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class _Objective(torch.nn.Module):
