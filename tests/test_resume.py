@@ -15,13 +15,16 @@ from typing import Any
 import hydra
 import pytest
 import torch
+import wandb
 from mocks import CONF
 from omegaconf import DictConfig, OmegaConf
 from test_training import TINY, config
 
 from hdmi import cli
+from hdmi.evaluation import EvalResult
 from hdmi.learning import CheckpointError, Trainer, load_checkpoint, save_checkpoint
 from hdmi.learning.checkpoint import checkpoints
+from hdmi.learning.logger import RunLogger
 from hdmi.learning.resume import differences, find_run, problem_changes
 
 # worlds are reset often: what is drawn for them would show
@@ -344,3 +347,81 @@ class TestFindRun:
     def test_refuses_nothing_at_all(self, tmp_path: Path) -> None:
         with pytest.raises(CheckpointError, match="no checkpoint_"):
             find_run(tmp_path)
+
+
+class TestWandb:
+    """Offline: W&B's own files, no network."""
+
+    @pytest.fixture(autouse=True)
+    def offline(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("WANDB_MODE", "offline")
+
+    def test_a_run_and_its_continuation_are_one_with_the_last_evaluation_and_the_video(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        runs: list[Any] = []
+        logged: list[dict] = []
+        init = wandb.init
+
+        def noted(**options: Any) -> Any:
+            run = init(**options)
+            runs.append({key: getattr(run, key) for key in ("id", "name", "group", "tags", "project")})
+            log = run.log
+            run.log = lambda row, **rest: (logged.append(row), log(row, **rest))
+            return run
+
+        def video(folder: Path) -> Path:
+            (folder / "video.mp4").write_bytes(b"pictures")
+            return folder / "video.mp4"
+
+        monkeypatch.setattr(wandb, "init", noted)
+        monkeypatch.setattr("hdmi.evaluation.render_checkpoint", video)
+        started = [*SHORT, "logger=offline", "video=true", "seed=3", "+ablation=no_rsi", "total_frames=32"]
+        command(cli.main, *started, f"output_dir={tmp_path}", "run_name=run")
+        command(cli.main, f"resume={tmp_path / 'run'}", "total_frames=64")
+        first, second = runs
+        assert first == second
+        assert first["name"] == "lift_box run"
+        assert (first["group"], first["project"]) == ("lift_box", "hdmi")
+        assert set(first["tags"]) == {"ablation=no_rsi", "seed=3"}
+        assert all(row["iteration"] in (1, 2) for row in logged)
+        for iteration in (1, 2):
+            rows = [row for row in logged if row["iteration"] == iteration]
+            assert any("kl" in row for row in rows)
+            assert any("eval/success_rate" in row for row in rows)
+            assert any(isinstance(row.get("video"), wandb.Video) for row in rows)
+        folders = sorted((tmp_path / "run" / "wandb").glob("offline-run-*"))
+        assert len(folders) == 2
+        assert all(folder.name.endswith(first["id"]) for folder in folders)
+        # in the run's own files, too
+        metrics = list(csv.DictReader((tmp_path / "run" / "metrics.csv").open()))
+        figures = EvalResult.load(tmp_path / "run" / "eval.json").figures()
+        assert float(metrics[-1]["eval/survival"]) == pytest.approx(figures["survival"]["mean"])
+        assert [row["iteration"] for row in metrics] == ["1", "2"]
+        assert metrics[0]["eval/survival"]
+
+    def test_what_keeps_it_from_starting_is_one_line(
+        self, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        def fail(**options: Any) -> None:
+            raise wandb.errors.UsageError("No API key configured.\nUse `wandb login` to log in.")
+
+        monkeypatch.setattr(wandb, "init", fail)
+        before = (run / "metrics.csv").read_bytes()
+        with pytest.raises(SystemExit) as end:
+            command(cli.main, f"resume={run}", "logger=online")
+        assert end.value.code == 2
+        told = capsys.readouterr().out.splitlines()[-1]
+        assert told.startswith("LoggerError: logger: W&B does not start in mode 'online': No API key configured.;")
+        assert "logger=csv" in told
+        assert (run / "metrics.csv").read_bytes() == before
+
+
+def test_a_metrics_file_that_was_cut_off_is_continued(run: Path, tmp_path: Path) -> None:
+    rows = (run / "metrics.csv").read_text()
+    (tmp_path / "metrics.csv").write_text(rows + "4,0.1")
+    logger = RunLogger(tmp_path, config(), last_iteration=9)
+    logger.log(4, {"reward": 0.5})
+    written = list(csv.DictReader((tmp_path / "metrics.csv").open()))
+    assert [row["iteration"] for row in written] == ["1", "2", "3", "4"]
+    assert written[-1]["reward"] == "0.5"
