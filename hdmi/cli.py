@@ -140,9 +140,10 @@ def open_run(cfg: DictConfig) -> tuple[DictConfig, Path, list[str]]:
         notes = [notes[0].removesuffix(", but for:")]
     if typed is not None:
         notes += [
-            f"  {key} stays {cfg.get(key)}: {why}"
+            f"  {key} stays {OmegaConf.select(cfg, key)}: {why}"
             for key, why in KEPT.items()
-            if any(text.startswith(f"{key}=") for text in typed) and given[key] != cfg.get(key)
+            if any(text.startswith(f"{key}=") for text in typed)
+            and OmegaConf.select(given, key) != OmegaConf.select(cfg, key)
         ]
     return cfg, folder, notes
 

@@ -173,6 +173,18 @@ class TestContinuation:
         trainer.run()
         assert load_checkpoint(tmp_path)["config"]["resume_anyway"] is False
 
+    def test_learning_rates_are_the_adapted_ones_unless_others_are_asked_for(self, run: Path, tmp_path: Path) -> None:
+        state = load_checkpoint(run)
+        state["actor_optim"]["param_groups"][0]["lr"] = 3e-5
+        path = tmp_path / "checkpoints" / "checkpoint_000003.pt"
+        save_checkpoint(path, state)
+        cfg = OmegaConf.create(state["config"])
+        cfg.resume, cfg.algo.critic_lr = str(path), 7e-5
+        trainer = Trainer(cfg, tmp_path)
+        trainer.collector.shutdown()
+        assert trainer.actor_optim.param_groups[0]["lr"] == 3e-5
+        assert trainer.critic_optim.param_groups[0]["lr"] == 7e-5
+
     def test_another_motion_of_the_same_name_is_refused(self, run: Path, tmp_path: Path) -> None:
         state = load_checkpoint(run)
         state["motion"] = "0" * 64
@@ -226,6 +238,11 @@ class TestConfig:
         assert (where, cfg.seed, cfg.run_name) == (folder, 3, None)
         assert any("seed stays 3" in note for note in notes)
         assert "seed=4" not in cfg.overrides
+
+    def test_the_noise_stays_what_was_learned(self, held: Callable[..., Path]) -> None:
+        cfg, _, notes = self.open(f"resume={held()}", "algo=ppo_wide", "algo.init_noise=0.9")
+        assert cfg.algo.init_noise == 0.12
+        assert any("algo.init_noise stays 0.12" in note for note in notes)
 
     def test_what_the_run_typed_may_be_typed_again(self, held: Callable[..., Path]) -> None:
         own = ["+ablation=no_residual", "task=lift_box", "seed=3"]

@@ -282,6 +282,7 @@ class FirstEpisodes:
         if self.whole_motion:
             names += [f"{name}{HORIZON}" for name in METRICS]
         names += [name for name in values if name not in names]
+        names.sort(key=lambda name: name.endswith(HORIZON))
         ended = {cause: mask for cause, mask in self._ended.items() if cause != _OTHER or mask.any()}
         return {name: _statistic(values.get(name)) for name in names} | {
             "termination_causes": {cause: float(mask.double().mean()) for cause, mask in ended.items()},

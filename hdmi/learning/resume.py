@@ -23,6 +23,7 @@ _OF_THE_CALL = ("resume", "resume_anyway", "overrides")
 # What a continued run has from its checkpoint or its place, whatever the command line says.
 KEPT = {
     "seed": "random numbers and worlds continue from the checkpoint",
+    "algo.init_noise": "the noise is what the policy has learned",
     "run_name": "a continued run stays in its folder",
     "output_dir": "a continued run stays in its folder",
 }
@@ -107,6 +108,9 @@ def continued_config(
     for path, value in new.items():
         if old.get(path, ABSENT) != value or any(path[: len(v)] == v or v[: len(path)] == path for v in values):
             _set(config, path, value)
+    for key in KEPT:  # groups may have changed them
+        if (value := OmegaConf.select(OmegaConf.create(dict(run)), key, default=ABSENT)) is not ABSENT:
+            _set(config, tuple(key.split(".")), value)
     config["overrides"] = _merged(parser.parse_overrides(list(run.get("overrides") or ())), added)
     made = OmegaConf.create(config)
     assert isinstance(made, DictConfig)

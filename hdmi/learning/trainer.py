@@ -415,6 +415,10 @@ class Trainer:
             raise CheckpointError("resume: the checkpoint's networks are not those of the config's algo") from error
         self.actor_optim.load_state_dict(state["actor_optim"])
         self.critic_optim.load_state_dict(state["critic_optim"])
+        for name, optimizer in (("actor_lr", self.actor_optim), ("critic_lr", self.critic_optim)):
+            if self.cfg.algo[name] != state["config"]["algo"][name]:  # asked for; else as adapted so far
+                for group in optimizer.param_groups:
+                    group["lr"] = self.cfg.algo[name]
         self.iteration, self.frames, self.elapsed = state["iteration"], state["frames"], state["elapsed"]
         self.averaged.n_averaged.fill_(self.iteration)
         if not self._changed:
