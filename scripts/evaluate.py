@@ -1,12 +1,15 @@
 """Evaluates a checkpoint by the paper's protocol; prints the figures and writes eval.json.
 
-    python scripts/evaluate.py checkpoint=RUN [num_envs=256] [terminations=all] [seed=0] [task=NAME] [sim=cpu|gpu] ...
+    python scripts/evaluate.py checkpoint=RUN [num_envs=256] [without=[NAME,...]] [terminations=all] [seed=0] ...
     python scripts/evaluate.py agent=zero|random [task=lift_box] ...
 
 `checkpoint` is a run folder (its newest checkpoint counts) or a checkpoint file. `terminations` are those that end
 an episode as a failure: `all` that the policy was trained with, `none`, or a list such as
-[root_pose,object_pose]. An agent instead of a checkpoint shows what a task is without a policy, in the environment of
-the default config. Its figures, and those of an exported policy, are written only where `out` says.
+[root_pose,object_pose]; `without` takes some of them away: without=[lost_contact] is the paper's evaluation of the
+interaction reward, on every task with contacts, without=[body_local_pose] that of the residual action. Errors are
+means over the steps survived, and as `..._horizon` over the whole motion, in which the world goes on after a failure.
+An agent instead of a checkpoint shows what a task is without a policy, in the environment of the default config. Its
+figures, and those of an exported policy, are written only where `out` says.
 """
 
 from __future__ import annotations
@@ -17,11 +20,11 @@ from typing import Any
 
 from rich.console import Console
 
-from hdmi.build import ConfigError
+from hdmi.build import ConfigError, make_task
 from hdmi.cli import run_script
 from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy
-from hdmi.evaluation.agents import AGENTS, BlindAgent, choose_engine, task_config
-from hdmi.evaluation.options import parse_options, parse_terminations
+from hdmi.evaluation.agents import AGENTS, blind_agent, choose_engine, task_config
+from hdmi.evaluation.options import parse_names, parse_options, parse_terminations
 
 
 @dataclass
@@ -32,6 +35,7 @@ class Options:
     agent: str | None = None
     num_envs: int = 256
     terminations: Any = "all"
+    without: Any = None  # names of terminations
     seed: int = 0
     task: str | None = None  # for an agent: lift_box; for a checkpoint: that it must be of
     motion_root: str | None = None  # instead of the training's
@@ -40,16 +44,18 @@ class Options:
     out: str | None = None  # file to write; of a run: instead of its eval.json
 
 
-def evaluate_agent(options: Options, terminations: list[str] | None) -> EvalResult:
+def evaluate_agent(options: Options, terminations: list[str] | None, without: list[str]) -> EvalResult:
     """Evaluates an agent that needs no training."""
-    assert options.agent is not None
+    if options.agent not in AGENTS:
+        raise ConfigError(f"agent: there is no {options.agent!r}; there is {', '.join(AGENTS)}")
     cfg = task_config(options.task or "lift_box", options.motion_root)
     if options.num_threads is not None:
         cfg.num_threads = options.num_threads
     if options.sim is not None:
         choose_engine(cfg, options.sim)
-    agent = BlindAgent(options.agent, cfg.action.history.size)
-    result = evaluate_policy(agent, cfg, options.num_envs, terminations=terminations, seed=options.seed)
+    task = make_task(cfg)
+    agent = blind_agent(options.agent, cfg, task)
+    result = evaluate_policy(agent, cfg, options.num_envs, task, terminations, options.seed, without)
     if options.out is not None:
         result.save(options.out)
     return result
@@ -62,9 +68,9 @@ def evaluate(arguments: list[str], console: Console) -> int:
         raise ConfigError(f"give either checkpoint=RUN or agent=, one of {', '.join(AGENTS)}")
     if options.num_envs < 1:
         raise ConfigError(f"num_envs: expected at least 1, got {options.num_envs}")
-    terminations = parse_terminations(options.terminations)
+    terminations, without = parse_terminations(options.terminations), parse_names(options.without)
     if options.checkpoint is None:
-        result = evaluate_agent(options, terminations)
+        result = evaluate_agent(options, terminations, without)
     else:
         result = evaluate_checkpoint(
             options.checkpoint,
@@ -76,6 +82,7 @@ def evaluate(arguments: list[str], console: Console) -> int:
             options.motion_root,
             options.num_threads,
             options.sim,
+            without,
         )
     console.print(result.table())
     if result.path is not None:

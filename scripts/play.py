@@ -20,7 +20,7 @@ from rich.console import Console
 from hdmi.build import ConfigError, Task, make_task
 from hdmi.cli import run_script
 from hdmi.evaluation import RenderingError
-from hdmi.evaluation.agents import AGENTS, BlindAgent, task_config
+from hdmi.evaluation.agents import AGENTS, blind_agent, task_config
 from hdmi.evaluation.options import parse_options
 from hdmi.evaluation.protocol import Policy, load_checked_policy, run_folder_of
 from hdmi.evaluation.video import Moment, Overlay, every, play_moments, replay, show, write_video
@@ -64,9 +64,9 @@ def prepare(options: Options) -> tuple[Task, Iterator[Moment], Path]:
             raise ConfigError(f"agent: there is no {options.agent!r}; there is {', '.join(agents)}")
         cfg = task_config(options.task or "lift_box", options.motion_root)
         out = Path(f"play_{cfg.task.name}_{options.agent}.mp4")
-        if options.agent != "reference":
-            policy = BlindAgent(options.agent, cfg.action.history.size)
     task = make_task(cfg)
+    if options.agent in AGENTS:
+        policy = blind_agent(options.agent, cfg, task)
     last = task.reference.num_frames - 1
     if not 0 <= options.start < last:
         raise ConfigError(f"start: expected a frame from 0 to {last - 1}, got {options.start}")

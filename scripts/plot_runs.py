@@ -6,7 +6,6 @@ python scripts/plot_runs.py RUN [RUN ...] --out curves.png
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +13,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import PercentFormatter
+
+from hdmi.metrics import read_rows
 
 # column -> label; shown are those that any run has
 CURVES = {
@@ -26,24 +27,26 @@ CURVES = {
     "eval/survival": "survival in evaluation",
 }
 _SHARES = ("episode_completed", "contact_rate", "eval/success_rate", "eval/survival")
+_TIMES = ("frames", "minutes")
 _COLOURS = ("#2a6fbb", "#d1603d", "#3a8f5c", "#8a5bb0", "#c29a2b", "#4fa3a5", "#b5477d", "#6b6b6b")
 
 
 def read_metrics(run: Path) -> dict[str, np.ndarray]:
-    """Columns of a run's metrics.csv, NaN where nothing was logged.
+    """Columns of a run's metrics.csv, NaN where nothing was logged; a row that is not complete is left out.
 
     Raises:
-        FileNotFoundError: if there is none. ValueError: if it is empty or not of numbers.
+        FileNotFoundError: if there is none. ValueError: if it has no rows yet or is not of numbers.
     """
     path = run if run.is_file() else run / "metrics.csv"
     if not path.is_file():
         raise FileNotFoundError(f"{run}: no metrics.csv there")
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    if not rows or "frames" not in rows[0]:
-        raise ValueError(f"{path}: no rows with a column 'frames'")
+    fields, rows = read_rows(path)
+    if not rows:
+        raise ValueError(f"{path}: no rows yet")
+    if missing := [key for key in _TIMES if key not in fields]:
+        raise ValueError(f"{path}: no column {missing[0]!r}")
     try:
-        return {key: np.array([float(row[key] or "nan") for row in rows]) for key in rows[0]}
+        return {key: np.array([float(row[key] or "nan") for row in rows]) for key in fields}
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -70,10 +73,23 @@ def smooth(values: np.ndarray, window: int) -> np.ndarray:
 def plot_runs(runs: Sequence[Path], out: Path, window: int = 1) -> None:
     """Draws the curves of all runs into a picture: one row per figure, against frames and against minutes.
 
+    A run without usable metrics.csv is told on the standard error output and left out.
+
     Raises:
-        FileNotFoundError, ValueError: for a run without usable metrics.csv.
+        ValueError: if no run is left.
     """
-    tables = [read_metrics(run) for run in runs]
+    found: dict[Path, dict[str, np.ndarray]] = {}
+    problems: list[str] = []
+    for run in runs:
+        try:
+            found[run] = read_metrics(run)
+        except (OSError, ValueError) as error:
+            problems.append(str(error))
+    if not found:
+        raise ValueError("; ".join(problems))
+    for problem in problems:
+        print(f"left out: {problem}", file=sys.stderr)
+    runs, tables = list(found), list(found.values())
     shown = [key for key in CURVES if any(np.isfinite(table.get(key, np.nan)).any() for table in tables)]
     if not shown:
         raise ValueError(f"none of the runs has any of {', '.join(CURVES)}")

@@ -18,8 +18,8 @@ from tensordict import TensorDict
 
 from hdmi.build import ConfigError, make_env
 from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy, protocol, render_checkpoint, video
-from hdmi.evaluation.agents import BlindAgent
-from hdmi.evaluation.options import parse_options, parse_terminations
+from hdmi.evaluation.agents import BlindAgent, blind_agent
+from hdmi.evaluation.options import parse_names, parse_options, parse_terminations
 from hdmi.evaluation.protocol import FirstEpisodes, StartAtFrame, evaluation_config, termination_names
 from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from hdmi.learning.policy import load_policy, make_networks
@@ -100,6 +100,26 @@ def test_a_diverged_step_is_not_measured():
     assert summary["termination_causes"] == {"diverged": 0.5}
 
 
+def test_errors_over_the_whole_motion_go_on_after_the_end_and_stop_at_a_divergence():
+    episodes = FirstEpisodes(3, horizon=4, causes=["a"])
+    for terminated, diverged, errors in (
+        ([True, False, False], [False, False, False], [1.0, 1.0, 1.0]),
+        ([True, False, False], [False, False, False], [2.0, 1.0, 3.0]),
+        ([False, False, True], [False, False, True], [3.0, 1.0, 99.0]),
+        ([True, False, False], [False, False, False], [4.0, 1.0, 99.0]),  # a diverged world begins anew
+    ):
+        episodes.add(
+            after(terminated, diverged, joint_error=errors, contact_made=[0.0] * 3, contact_intended=[0.0] * 3)
+        )
+    values = episodes.values()
+    assert values["joint_error"].tolist() == [1.0, 1.0, 2.0]
+    assert values["joint_error_horizon"].tolist() == pytest.approx([2.5, 1.0, (1 + 3 + 3 + 3) / 4])
+    assert "contact_made_horizon" not in values
+    summary = episodes.summary()
+    assert summary["joint_error_horizon"]["mean"] == pytest.approx(2.0)
+    assert summary["object_pos_error_horizon"] is None
+
+
 def test_contact_rate_is_made_over_intended_where_contact_is_intended():
     episodes = FirstEpisodes(3, horizon=3)
     episodes.add(after([False] * 3, contact_made=[0.0, 0.0, 0.0], contact_intended=[0.0, 0.0, 0.0]))
@@ -155,6 +175,32 @@ def test_terminations_can_be_chosen():
     assert termination_names(evaluation_config(trained, [])) == []
     with pytest.raises(ConfigError, match=r"no \['falling'\]; there is \['root_pose'"):
         evaluation_config(trained, ["falling"])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "without", "left"),
+    [
+        ([], ["lost_contact"], ["root_pose", "body_local_pose", "object_pose"]),
+        (["task=open_foldchair_sit"], ["lost_contact"], ["root_pose", "body_local_pose", "object_joint"]),
+        (["task=move_stool"], ["lost_contact"], None),
+        ([], ["body_local_pose", "object_pose"], ["root_pose", "lost_contact"]),
+        # a training that went without is evaluated like the others
+        (["+ablation=no_interaction_reward_no_contact_termination"], ["lost_contact"], None),
+    ],
+)
+def test_terminations_can_be_left_out(overrides: list[str], without: list[str], left: list[str] | None):
+    trained = load_config(*overrides)
+    chosen = termination_names(evaluation_config(trained, without=without))
+    assert chosen == [name for name in termination_names(trained) if name not in without]
+    assert left is None or chosen == left
+
+
+def test_what_cannot_be_left_out_is_told():
+    for task, name in (("walk", "lost_contact"), ("lift_box", "falling"), ("lift_box", "motion_end")):
+        with pytest.raises(ConfigError, match=rf"without: the task has no \['{name}'\]; there is \['root_pose'"):
+            evaluation_config(load_config(f"task={task}"), without=[name])
+    chosen = evaluation_config(load_config(), ["root_pose", "lost_contact"], without=["lost_contact"])
+    assert termination_names(chosen) == ["root_pose"]
 
 
 def test_a_start_beyond_the_motion_is_refused():
@@ -263,6 +309,20 @@ def test_an_agent_is_evaluated_without_a_checkpoint(tmp_path: Path, capsys: pyte
     assert 0 <= figures["success_rate"]["mean"] <= 1
     # it stands and moves as the reference asks its servos to
     assert figures["body_error"]["mean"] < 0.1
+
+
+def test_an_agent_is_as_wide_as_the_environments_actions():
+    """Whether there is a history of actions, and whatever that says."""
+    nodes = ["action.history=null", "observation.policy.actions=null", "reward.action_rate=null"]
+    cfg = load_config(*nodes)
+    agent = blind_agent("zero", cfg, lift_box())
+    assert agent.action_size == 23
+    result = evaluate_policy(agent, cfg, 1, lift_box(), whole_motion=False)
+    assert result["survival"]["mean"] > 0
+    assert not [name for name in result if name.endswith("_horizon")]
+    narrow = load_config("action.history.size=2")
+    narrow.action.joint_position.scale = {".*_knee_joint": 0.3}
+    assert blind_agent("random", narrow, lift_box()).action_size == 2
 
 
 def test_blind_agents():
@@ -398,12 +458,20 @@ def test_termination_choices():
     assert parse_terminations("none") == []
     assert parse_terminations(["a", "b"]) == ["a", "b"]
     assert parse_terminations("a") == ["a"]
+    assert parse_names(None) == []
+    assert parse_names("lost_contact") == ["lost_contact"]
+    assert parse_names(["a", "all"]) == ["a", "all"]
 
 
 @pytest.mark.parametrize(
     ("name", "arguments", "message"),
     [
         ("evaluate", [], "give either checkpoint=RUN or agent=, one of zero, random"),
+        (
+            "evaluate",
+            ["agent=zero", "task=walk", "without=[lost_contact]"],
+            "no ['lost_contact']; there is ['root_pose'",
+        ),
         ("evaluate", ["agent=best"], "there is no 'best'; there is zero, random"),
         ("evaluate", ["checkpoint=nowhere"], "nowhere"),
         ("evaluate", ["run=nowhere"], "unknown option 'run'"),
@@ -437,3 +505,33 @@ def test_runs_are_plotted(tmp_path: Path):
     image = imageio.imread(out)
     assert image.shape[1] > 600
     assert image[..., :3].std() > 5
+
+
+def test_runs_without_rows_are_left_out_of_the_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    header = "iteration,frames,minutes,joint_error\n"
+    contents = {
+        "good": header + "0,100,0.5,0.3\n1,200,1.0,0.2\n",
+        "cut_off": header + "0,100,0.5,0.3\n1,2",
+        "empty": "",
+        "header": header,
+        "first_row_cut_off": header + "0,10",
+        "other": "a,b\n1,2\n",
+    }
+    for name, text in contents.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "metrics.csv").write_text(text)
+    (tmp_path / "absent").mkdir()
+    names = [*contents, "absent"]
+    out = tmp_path / "curves.png"
+    assert script("plot_runs").main([*(str(tmp_path / name) for name in names), "--out", str(out)]) == 0
+    assert out.is_file()
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 5
+    for name in ("empty", "header", "first_row_cut_off", "other", "absent"):
+        assert any(line.startswith("left out: ") and f"/{name}" in line for line in told), name
+    out.unlink()
+    assert script("plot_runs").main([*(str(tmp_path / name) for name in names[2:]), "--out", str(out)]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert not out.exists()
+    table = script("plot_runs").read_metrics(tmp_path / "cut_off")
+    assert table["frames"].tolist() == [100]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import math
 import os
+import pickle
 import re
 import signal
 import subprocess
@@ -15,13 +17,14 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives.value import GAE
 
-from hdmi.cli import run_folder
+from hdmi.cli import open_run, run_folder
 from hdmi.learning import CheckpointError, RunningNorm, Trainer, load_checkpoint, load_policy, save_checkpoint
 from hdmi.learning.checkpoint import FORMAT, checkpoints, claim
-from hdmi.learning.networks import network_of, normalised_networks
+from hdmi.learning.networks import bound_noise, make_actor, network_of, normalised_networks
 from hdmi.learning.policy import export_policy, make_networks
 from hdmi.learning.trainer import DivergenceError
 
@@ -181,9 +184,21 @@ class TestCheckpoint:
         with pytest.raises(CheckpointError, match="no checkpoint"):
             load_checkpoint(tmp_path)
         path = tmp_path / "checkpoint_000001.pt"
-        path.write_bytes(b"not a checkpoint")
-        with pytest.raises(CheckpointError, match="checkpoint_000001"):
-            load_checkpoint(tmp_path)
+        for content in (
+            b"",
+            b"not a checkpoint",
+            b"a: yaml\n",
+            pickle.dumps({"format": FORMAT}, protocol=2),
+            b"\x89PNG\r\n\x1a\n",
+            b"PK\3\4",
+        ):
+            path.write_bytes(content)
+            with pytest.raises(
+                CheckpointError, match=r"checkpoint_000001\.pt: damaged or not a checkpoint; "
+            ) as failed:
+                load_checkpoint(tmp_path)
+            assert len(str(failed.value).splitlines()) == 1
+            assert "weights_only" not in str(failed.value)
         torch.save({"something": torch.zeros(1)}, path)
         with pytest.raises(CheckpointError, match="format"):
             load_checkpoint(path)
@@ -258,7 +273,7 @@ class TestPrepare:
     @pytest.fixture(scope="class")
     def batch(self, fresh: Trainer) -> TensorDictBase:
         torch.manual_seed(0)
-        with torch.no_grad():
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):  # the probabilities of means say little
             batch = fresh.env.rollout(6, fresh.actor, break_when_any_done=False)
         # the middle of one world's rollout becomes the end of an episode; of another's, one that is only cut off
         for world, terminated in ((0, True), (1, False)):
@@ -303,6 +318,55 @@ class TestPrepare:
         )
         assert {id(p) for p in own_actor.parameters()} == {id(p) for p in actor.parameters()}
         assert {id(p) for p in own_critic.parameters()} == {id(p) for p in critic.parameters()}
+
+
+def test_first_moments_come_from_sampled_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    batches: list[TensorDictBase] = []
+    update = Trainer._update_moments
+    monkeypatch.setattr(Trainer, "_update_moments", lambda self, batch: (batches.append(batch), update(self, batch)))
+    trainer = Trainer(config(), tmp_path)
+    assert len(batches) == 1
+    spread = (batches[0]["action"] - batches[0]["loc"]).std()
+    torch.testing.assert_close(spread, torch.tensor(trainer.cfg.algo.init_noise), rtol=0.1, atol=0)
+    trainer.collector.shutdown()
+
+
+class TestNoise:
+    def actor(self, log_std: list[float]) -> torch.nn.Module:
+        torch.manual_seed(0)
+        actor = make_actor(3, len(log_std), [8], "SiLU", init_noise=1.0, bf16=False)
+        with torch.no_grad():
+            network_of(actor).log_std.copy_(torch.tensor(log_std))
+        return actor
+
+    def scale(self, actor: torch.nn.Module) -> torch.Tensor:
+        return actor(TensorDict({"policy": torch.zeros(5, 3)}, [5]))["scale"]
+
+    def test_is_what_the_parameter_says_within_bounds_and_the_bound_beyond(self) -> None:
+        values = [-8.0, -2.9, -1.3, 0.5, 3.0]
+        expected = torch.tensor([0.05, math.exp(-2.9), math.exp(-1.3), math.exp(0.5), 2.0])
+        torch.testing.assert_close(self.scale(self.actor(values))[0], expected)
+
+    @pytest.mark.parametrize(("start", "direction", "bound"), [(-8.0, 1.0, 0.05), (3.0, -1.0, 2.0)])
+    def test_comes_back_from_beyond_a_bound(self, start: float, direction: float, bound: float) -> None:
+        actor = self.actor([start])
+        optimizer = torch.optim.Adam(actor.parameters(), lr=0.05)
+        for _ in range(3):
+            optimizer.zero_grad()
+            (-direction * self.scale(actor).mean()).backward()
+            optimizer.step()
+            bound_noise(actor)
+        assert direction * (float(self.scale(actor)[0, 0].detach()) - bound) > 0.01 * bound
+
+    def test_does_not_move_away_behind_a_bound(self) -> None:
+        actor = self.actor([-2.9])
+        optimizer = torch.optim.Adam(actor.parameters(), lr=0.5)
+        for _ in range(5):
+            optimizer.zero_grad()
+            self.scale(actor).mean().backward()
+            optimizer.step()
+            bound_noise(actor)
+        assert network_of(actor).log_std.item() == pytest.approx(math.log(0.05))
 
 
 def test_running_norm_matches_moments_of_all_batches() -> None:
@@ -350,4 +414,4 @@ class TestRunFolder:
         with pytest.raises(CheckpointError, match="holds a run already"):
             run_folder(cfg)
         cfg.resume = str(folder)
-        assert run_folder(cfg) == folder
+        assert open_run(cfg)[1] == folder

@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, open_dict
 from tensordict import TensorDictBase
 
-from hdmi.build import ConfigError
+from hdmi.build import ConfigError, Task, make_env
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 AGENTS = ("zero", "random")
@@ -36,6 +36,18 @@ class BlindAgent(torch.nn.Module):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = torch.empty(*tensordict.batch_size, self.action_size, device=tensordict.device)
         return tensordict.set("action", action.uniform_(-self.half_range, self.half_range))
+
+
+def blind_agent(kind: str, cfg: DictConfig, task: Task) -> BlindAgent:
+    """A `BlindAgent` for the environment of a config, whose actions are as wide as the environment's.
+
+    Raises:
+        ConfigError: if there is no such agent, or the environment cannot be built.
+    """
+    env = make_env(cfg, 1, task)
+    size = env.action_spec.shape[-1]
+    env.close()
+    return BlindAgent(kind, size)
 
 
 def choose_engine(cfg: DictConfig, name: str) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from hdmi.evaluation.protocol import UNITS, EvalResult, evaluate_checkpoint
+from hdmi.evaluation.protocol import EvalResult, evaluate_checkpoint, unit_of
 from hdmi.evaluation.video import render_checkpoint
 from hdmi.learning import export_policy, load_checkpoint
 from hdmi.learning.checkpoint import POLICY_FILE
@@ -72,7 +72,7 @@ def _card(state: dict, result: EvalResult, folder: Path, seed: int) -> str:
 
 
 def _shown(name: str, value: float) -> str:
-    unit = UNITS.get(name, "")
+    unit = unit_of(name)
     return f"{100 * value:.1f} %" if unit == "%" else f"{value:.3g} {unit}".rstrip()
 
 

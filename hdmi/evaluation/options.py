@@ -49,8 +49,11 @@ def parse_motion_options(cls: type[T], arguments: Sequence[str]) -> tuple[Path, 
 
 def parse_terminations(value: Any) -> list[str] | None:
     """`all` (those of the training) -> None, `none` -> [], a list or a single name -> names."""
-    if value is None or value == "none":
+    return None if value == "all" else parse_names(None if value == "none" else value)
+
+
+def parse_names(value: Any) -> list[str]:
+    """A list of names, a single one, or null for none."""
+    if value is None:
         return []
-    if value == "all":
-        return None
     return [str(name) for name in (value if isinstance(value, list) else [value])]

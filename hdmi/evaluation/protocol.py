@@ -1,4 +1,9 @@
-"""The evaluation protocol of the paper: first episodes from the first frame over the whole motion, deterministic."""
+"""The evaluation protocol of the paper: first episodes from the first frame over the whole motion, deterministic.
+
+A metric is averaged over the steps that an environment survives, so that a policy that falls at once may have the
+smallest errors. Each error is therefore there a second time, `<name>_horizon`, averaged over all steps of the motion:
+the world goes on after the termination, the robot lying where it fell.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +23,7 @@ from torch import Tensor
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
 from hdmi.build import ConfigError, Task, make_env, make_task
-from hdmi.evaluation.agents import choose_engine
+from hdmi.evaluation.agents import choose_engine, task_config, task_names
 from hdmi.learning.checkpoint import POLICY_FILE, CheckpointError
 from hdmi.learning.policy import load_policy
 from hdmi.motion import Reference
@@ -47,9 +52,15 @@ UNITS = {
     "object_ori_error": "rad",
     "object_joint_error": "rad",
 }
+HORIZON = "_horizon"  # of errors over the whole motion, survived or not
 _MADE, _INTENDED = "contact_made", "contact_intended"
 _NOT_TERMINATIONS = ("motion_end", "step_count")  # in the group, but no failures
 _DIVERGED, _OTHER = "diverged", "other"
+
+
+def unit_of(figure: str) -> str:
+    """Unit of a figure, empty if it has none."""
+    return UNITS.get(figure.removesuffix(HORIZON), "")
 
 
 class StartAtFrame(ReferenceStateInitialization):
@@ -75,12 +86,16 @@ class StartAtFrame(ReferenceStateInitialization):
         return torch.full(tuple(batch_size), self.frame, dtype=torch.int64, device=device)
 
 
-def evaluation_config(cfg: DictConfig, terminations: Sequence[str] | None = None, start: int = 0) -> DictConfig:
+def evaluation_config(
+    cfg: DictConfig, terminations: Sequence[str] | None = None, start: int = 0, without: Sequence[str] = ()
+) -> DictConfig:
     """The training config changed to the protocol; reset noise, randomization and observation noise stay.
 
     Args:
         terminations: names of the terminations that end episodes; None for those of the training.
         start: frame of the reference that episodes start from.
+        without: names of terminations that do not, whatever `terminations` says. The task must have them; a training
+            may have gone without.
 
     Raises:
         ConfigError: for a termination that the config does not have.
@@ -94,12 +109,13 @@ def evaluation_config(cfg: DictConfig, terminations: Sequence[str] | None = None
         state = kept | where | {"_target_": f"{cls.__module__}.{cls.__qualname__}"}
         cfg.reset = {**(cfg.reset or {}), "state": state}
         known = termination_names(cfg)
-        if terminations is not None:
-            if unknown := [name for name in terminations if name not in known]:
-                raise ConfigError(f"terminations: the config has no {unknown}; there is {known}")
-            for name in known:
-                if name not in terminations:
-                    cfg.termination[name] = None
+        if unknown := [name for name in terminations or () if name not in known]:
+            raise ConfigError(f"terminations: the config has no {unknown}; there is {known}")
+        if unknown := [name for name in without if name not in known and name not in _terminations_of_task(cfg)]:
+            raise ConfigError(f"without: the task has no {unknown}; there is {known}")
+        for name in known:
+            if name in without or (terminations is not None and name not in terminations):
+                cfg.termination[name] = None
     return cfg
 
 
@@ -107,6 +123,11 @@ def termination_names(cfg: DictConfig) -> list[str]:
     """Nodes of a config that end episodes as failures."""
     nodes = cfg.termination or {}
     return [str(name) for name, node in nodes.items() if node is not None and name not in _NOT_TERMINATIONS]
+
+
+def _terminations_of_task(cfg: DictConfig) -> list[str]:
+    """Those of a config's task without ablations; none for a task that conf/task does not have."""
+    return termination_names(task_config(cfg.task.name)) if cfg.task.name in task_names() else []
 
 
 def make_evaluation_env(cfg: DictConfig, task: Task, num_envs: int) -> TransformedEnv:
@@ -172,7 +193,7 @@ class EvalResult(Mapping[str, Any]):
             table.add_column(column, justify="right")
         table.add_column("unit")
         for name, value in self.figures().items():
-            unit = UNITS.get(name, "")
+            unit = unit_of(name)
             shown = (
                 f"{value[key] * 100:.1f}" if unit == "%" else f"{value[key]:.3g}" for key in ("mean", "std")
             )  # fmt: skip
@@ -189,20 +210,25 @@ class FirstEpisodes:
     """Accumulates the figures of the first episode of every environment.
 
     An environment counts up to and including the step that terminates it; a step whose physics diverged has no state
-    of its own and only ends the episode.
+    of its own and only ends the episode. Errors over the whole motion go on after the end, up to a divergence: from
+    there on the last ones count.
 
     Args:
         num_envs: environments. horizon: steps of a full episode. causes: termination names, the first has precedence.
+        whole_motion: whether errors over the whole motion are wanted; all its steps must then be added.
     """
 
-    def __init__(self, num_envs: int, horizon: int, causes: Sequence[str] = ()):
-        self.horizon = horizon
+    def __init__(self, num_envs: int, horizon: int, causes: Sequence[str] = (), whole_motion: bool = True):
+        self.horizon, self.whole_motion = horizon, whole_motion
         self.causes = (_DIVERGED, *causes, _OTHER)
         self.alive = torch.ones(num_envs, dtype=torch.bool)
         self.survived = torch.zeros(num_envs, dtype=torch.int64)  # steps without termination
         self.steps = 0
         self._counted = torch.zeros(num_envs, dtype=torch.int64)
         self._sums: dict[str, Tensor] = {}
+        self._sound = torch.ones(num_envs, dtype=torch.bool)  # never diverged
+        self._last: dict[str, Tensor] = {}  # metrics of the last step that did not diverge
+        self._horizon_sums: dict[str, Tensor] = {}
         self._ended = {cause: torch.zeros(num_envs, dtype=torch.bool) for cause in self.causes}
 
     def add(self, after: TensorDictBase) -> None:
@@ -211,11 +237,15 @@ class FirstEpisodes:
         terminated = after["terminated"].reshape(-1).cpu()
         diverged = _flag(after.get("diverged", None), terminated)
         measured = self.alive & ~diverged
+        self._sound &= ~diverged
         metrics = after.get("metrics", None)
         for name, value in () if metrics is None else metrics.items():
             value = value.reshape(-1).double().cpu()
             total = self._sums.setdefault(name, torch.zeros_like(value))
             total += torch.where(measured, value, 0)
+            if self.whole_motion and name.endswith("_error"):
+                self._last[name] = torch.where(self._sound, value, self._last.get(name, torch.nan))
+                self._horizon_sums[name] = self._horizon_sums.get(name, 0) + self._last[name]
         self._counted += measured
 
         unexplained = self.alive & (terminated | diverged)
@@ -243,13 +273,16 @@ class FirstEpisodes:
         out |= {name: total / self._counted for name, total in self._sums.items() if name not in (_MADE, _INTENDED)}
         if _MADE in self._sums:
             out["contact_rate"] = self._sums[_MADE] / self._sums[_INTENDED]
-        return out
+        return out | {f"{name}{HORIZON}": total / self.steps for name, total in self._horizon_sums.items()}
 
     def summary(self) -> dict[str, Any]:
         """Mean and standard deviation over environments, and why and when episodes failed."""
         values = self.values()
         names = ["success_rate", "survival", *METRICS, "contact_rate"]
+        if self.whole_motion:
+            names += [f"{name}{HORIZON}" for name in METRICS]
         names += [name for name in values if name not in names]
+        names.sort(key=lambda name: name.endswith(HORIZON))
         ended = {cause: mask for cause, mask in self._ended.items() if cause != _OTHER or mask.any()}
         return {name: _statistic(values.get(name)) for name in names} | {
             "termination_causes": {cause: float(mask.double().mean()) for cause, mask in ended.items()},
@@ -285,15 +318,21 @@ def on_device(actor: torch.nn.Module, device: torch.device | None) -> Policy:
 
 
 @torch.no_grad()
-def run_episodes(env: TransformedEnv, policy: Policy, horizon: int, causes: Sequence[str] = ()) -> FirstEpisodes:
-    """Plays one episode in every environment, without resets in between, until all have ended."""
-    episodes = FirstEpisodes(env.batch_size[0], horizon, causes)
+def run_episodes(
+    env: TransformedEnv, policy: Policy, horizon: int, causes: Sequence[str] = (), whole_motion: bool = True
+) -> FirstEpisodes:
+    """Plays one episode in every environment, without resets in between.
+
+    Args:
+        whole_motion: play the motion to its end, for errors over all of it; otherwise until all episodes have ended.
+    """
+    episodes = FirstEpisodes(env.batch_size[0], horizon, causes, whole_motion)
     tensordict = env.reset()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(horizon):
             stepped = env.step(policy(tensordict))
             episodes.add(stepped["next"])
-            if not episodes.alive.any():
+            if not whole_motion and not episodes.alive.any():
                 break
             tensordict = env.step_mdp(stepped)
     return episodes
@@ -306,6 +345,8 @@ def evaluate_policy(
     task: Task | None = None,
     terminations: Sequence[str] | None = None,
     seed: int = 0,
+    without: Sequence[str] = (),
+    whole_motion: bool = True,
 ) -> EvalResult:
     """Evaluates an actor under the conditions it was trained with.
 
@@ -318,11 +359,13 @@ def evaluate_policy(
         task: made from the config if absent.
         terminations: names of those that end episodes; None for those of the training, empty for none.
         seed: of start states, randomization and noise. The caller's random state is left alone.
+        without: names of terminations that do not end episodes.
+        whole_motion: measure errors over the whole motion, too; without, it ends with the last episode.
 
     Raises:
         ConfigError: for a termination that the config does not have, or a config that cannot be built.
     """
-    cfg = evaluation_config(cfg, terminations)
+    cfg = evaluation_config(cfg, terminations, without=without)
     task = make_task(cfg) if task is None else task
     causes = termination_names(cfg)
     horizon = task.reference.num_frames - 1
@@ -332,7 +375,7 @@ def evaluate_policy(
         env = make_evaluation_env(cfg, task, num_envs)
         try:
             actor.eval()
-            episodes = run_episodes(env, on_device(actor, env.device), horizon, causes)
+            episodes = run_episodes(env, on_device(actor, env.device), horizon, causes, whole_motion)
             env.base_env.backend.overflows()  # warns
         finally:
             actor.train(was_training)
@@ -360,6 +403,7 @@ def evaluate_checkpoint(
     motion_root: str | None = None,
     num_threads: int | None = None,
     sim: str | None = None,
+    without: Sequence[str] = (),
 ) -> EvalResult:
     """Evaluates a checkpoint by `evaluate_policy` and writes eval.json, which its result then names as `path`.
 
@@ -370,6 +414,7 @@ def evaluate_checkpoint(
         task: that the checkpoint must be of.
         motion_root, num_threads: instead of the training's.
         sim: engine (`cpu`, `gpu`) instead of the training's.
+        without: names of terminations that do not end episodes.
 
     Raises:
         CheckpointError: if there is no usable checkpoint, or it is of another task.
@@ -383,7 +428,7 @@ def evaluate_checkpoint(
         cfg.num_threads = num_threads
     if sim is not None:
         choose_engine(cfg, sim)
-    values = evaluate_policy(actor, cfg, num_envs, terminations=terminations, seed=seed)
+    values = evaluate_policy(actor, cfg, num_envs, terminations=terminations, seed=seed, without=without)
     file = Path(info["file"])
     folder = run_folder_of(file)
     origin = {

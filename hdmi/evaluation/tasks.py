@@ -21,7 +21,7 @@ from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration
 
 from hdmi.build import ConfigError, Task, make_env, make_task, scene_parts, set_threads
 from hdmi.envs.rendering import WorldRenderer
-from hdmi.evaluation.agents import BlindAgent, task_config, task_names
+from hdmi.evaluation.agents import blind_agent, task_config, task_names
 from hdmi.evaluation.protocol import EvalResult, evaluate_policy
 from hdmi.evaluation.video import Moment, Overlay, picture, replay
 from hdmi.learning import Trainer
@@ -214,7 +214,7 @@ def check_task(
                 f"{contact.effector}: on average {mean:.2f} m from its contact point where labels say that it touches, "
                 f"and lost_contact allows {limit:g} m"
             )
-    check.zero = evaluate_policy(BlindAgent("zero", cfg.action.history.size), cfg, _EPISODES, task)
+    check.zero = evaluate_policy(blind_agent("zero", cfg, task), cfg, _EPISODES, task)
     bad = [key for key, value in check.zero.figures().items() if not math.isfinite(value["mean"])]
     if bad or not check.zero.figures():
         check.problems.append(f"no policy: {bad or 'no figures'} not finite")

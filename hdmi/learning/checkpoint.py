@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -70,8 +69,22 @@ def rotate(folder: Path, keep: int) -> None:
 
 
 def checkpoints(folder: Path) -> list[Path]:
-    """Checkpoints of a run folder, oldest first."""
-    return sorted(folder.glob("checkpoint_*.pt"))
+    """Checkpoints in a folder, oldest first."""
+    return sorted(folder.glob("checkpoint_*.pt"), key=lambda path: (len(path.name), path.name))
+
+
+def supersede(folder: Path, iteration: int) -> list[Path]:
+    """Moves the checkpoints after an iteration into `superseded`: the run goes on from that one, they would be newer.
+
+    Returns:
+        Where they are now.
+    """
+    moved = []
+    for path in checkpoints(folder):
+        if path.stem.removeprefix("checkpoint_").isdecimal() and int(path.stem.removeprefix("checkpoint_")) > iteration:
+            (folder / "superseded").mkdir(exist_ok=True)
+            moved.append(path.replace(folder / "superseded" / path.name))
+    return moved
 
 
 def find_checkpoint(path: str | Path) -> Path:
@@ -100,8 +113,12 @@ def load_checkpoint(path: str | Path, map_location: str | torch.device = "cpu") 
     file = find_checkpoint(path)
     try:
         state = torch.load(file, map_location=map_location, weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, ValueError, KeyError) as error:
-        raise CheckpointError(f"{file}: damaged or not a checkpoint: {error}") from error
+    except OSError as error:
+        raise CheckpointError(f"{file}: cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # a file of anything else: whatever reading it as a checkpoint leads to
+        raise CheckpointError(
+            f"{file}: damaged or not a checkpoint; expected what train.py or scripts/export.py wrote, or its folder"
+        ) from error
     if not isinstance(state, dict) or state.get("format") != FORMAT:
         raise CheckpointError(f"{file}: not an hdmi checkpoint of format {FORMAT}")
     return state

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -84,7 +85,10 @@ class _ValueHead(_Network):
 
 
 class _GaussianHead(_Network):
-    """Mean from the network, standard deviation a free parameter per action."""
+    """Mean from the network, standard deviation a free parameter per action, within bounds.
+
+    Beyond a bound its gradient is the bound's, so that it can come back; `bound_noise` keeps it from moving away.
+    """
 
     def __init__(self, in_size: int, out_size: int, init_noise: float, **kwargs: Any):
         super().__init__(in_size, out_size, gain=0.01, **kwargs)
@@ -92,7 +96,12 @@ class _GaussianHead(_Network):
 
     def forward_normalised(self, normalised: Tensor) -> tuple[Tensor, Tensor]:
         loc = super().forward_normalised(normalised)
-        return loc, self.log_std.exp().clamp(_MIN_STD, _MAX_STD).expand_as(loc)
+        within = self.log_std + (self.bounded() - self.log_std).detach()
+        return loc, within.exp().expand_as(loc)
+
+    def bounded(self) -> Tensor:
+        """The parameter, or the bound that it has crossed."""
+        return self.log_std.clamp(math.log(_MIN_STD), math.log(_MAX_STD))
 
 
 def make_actor(
@@ -134,6 +143,17 @@ class _AfterNorm(nn.Module):
 def network_of(module: nn.Module) -> _Network:
     """The network of an actor or critic."""
     return next(m for m in module.modules() if isinstance(m, _Network))
+
+
+@torch.no_grad()
+def bound_noise(actor: nn.Module) -> None:
+    """Puts parameters of an actor's standard deviations back to the bound that they have crossed.
+
+    To call after an optimizer's step.
+    """
+    for head in actor.modules():
+        if isinstance(head, _GaussianHead):
+            head.log_std.copy_(head.bounded())
 
 
 def normalised_networks(actor: nn.Module, critic: nn.Module) -> tuple[ProbabilisticActor, ValueOperator]:

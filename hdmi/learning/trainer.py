@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import signal
 import sys
+import threading
 import time
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,17 +21,20 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel
+from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.utils import KLAdaptiveLR
 from torchrl.objectives.value import GAE
 
 from hdmi.build import Task, build, make_task, set_threads
 from hdmi.console import make_console
-from hdmi.learning.checkpoint import CheckpointError, claim, load_checkpoint, rotate, save_checkpoint
+from hdmi.learning.checkpoint import CheckpointError, claim, load_checkpoint, rotate, save_checkpoint, supersede
 from hdmi.learning.distributed import Ranks
 from hdmi.learning.logger import RunLogger
-from hdmi.learning.networks import network_of, normalised_networks
+from hdmi.learning.networks import bound_noise, network_of, normalised_networks
 from hdmi.learning.policy import make_networks
+from hdmi.learning.resume import CONFIG_FILE, problem_changes
+from hdmi.motion import find_motion
 
 _WARMUP_STEPS = 8  # of the untrained policy, for first observation moments
 _MAX_BAD_UPDATES = 20  # minibatches without finite loss or gradient, in a row
@@ -48,11 +56,15 @@ class Trainer:
     than any of them.
 
     Args:
-        cfg: the whole config.
+        cfg: the whole config; `cfg.resume` is a checkpoint to continue from, or null.
         folder: of the run; checkpoints, metrics.csv and config.yaml are written there.
 
     Attributes:
         actor: that acts in training. averaged: `averaged.module` is the policy that leaves it.
+
+    Raises:
+        CheckpointError: for a checkpoint that cannot be continued under this config; see `restore`.
+        ConfigError, MotionError: for a config that cannot be built.
     """
 
     def __init__(self, cfg: DictConfig, folder: Path):
@@ -62,11 +74,16 @@ class Trainer:
         if self.device.type == "cuda" and self.device.index is None:
             self.device = torch.device("cuda", self.ranks.local_rank)
             torch.cuda.set_device(self.device)  # where NCCL exchanges objects
+        self._changed: list[str] = []  # nodes that make another problem of a continued run
+        state = None if cfg.resume is None else load_checkpoint(cfg.resume, self.device)
+        if state is not None:
+            self._check_resume(state)
         cfg.num_threads = self.ranks.threads(cfg.num_threads)
         set_threads(cfg.num_threads)
         seed = self.ranks.seed(cfg.seed)
         torch.manual_seed(seed)
         self.task: Task = make_task(cfg)
+        self.motion_digest = _digest(find_motion(cfg.task.motion, cfg.motion_root))
         self.collector = build(cfg.collector, "collector", cfg=cfg, task=self.task, seed=seed)
         self.env = self.collector.env
         self.env.set_seed(seed)
@@ -103,13 +120,14 @@ class Trainer:
         self.elapsed = 0.0  # s of collection and learning
         self._warm_up()
         self.collector.start(self.actor)
-        if cfg.resume is not None:
-            self.restore(load_checkpoint(cfg.resume, self.device))
+        if state is not None:
+            self.restore(state)
 
     # -- one iteration ----------------------------------------------------------------------------------------
 
     def _warm_up(self) -> None:
-        with torch.no_grad():
+        # sampled actions, as in training: means alone would leave the history of actions without variance
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             batch = self.env.rollout(_WARMUP_STEPS, self.actor, break_when_any_done=False, auto_cast_to_device=True).to(
                 self.device
             )
@@ -211,31 +229,46 @@ class Trainer:
         self.bad_updates = 0
         self.actor_optim.step()
         self.critic_optim.step()
+        bound_noise(self.actor)
         row = dict(zip(figures, values, strict=True))
         self.schedule.step(row["kl"])
         return row
 
     # -- the loop ---------------------------------------------------------------------------------------------
 
-    def run(self) -> None:
-        """Trains up to `cfg.total_frames`; an interrupt leaves a checkpoint to resume from.
+    def run(self, finish: Callable[[RunLogger], None] | None = None) -> None:
+        """Trains up to `cfg.total_frames`; an interrupt ends it after the iteration, with a checkpoint to resume from.
 
-        Of several ranks the first one logs and writes; interrupted, they leave the last periodic checkpoint.
+        A second interrupt does not wait: what was collected for that iteration is then lost to the continued run. Of
+        several ranks the first one logs and writes; interrupted, they leave the last periodic checkpoint.
+        Checkpoints of the folder that are newer than where the run continues are set aside in `superseded`.
+
+        Args:
+            finish: what to do with the trained policy, on the first rank, while the log is still open.
 
         Raises:
             CheckpointError: if another process trains in the run folder.
+            LoggerError: if W&B does not start.
             DivergenceError: if updates stay without finite loss.
             WorkerError: if a worker of the collector is gone; the last periodic checkpoint stays.
             KeyboardInterrupt: after saving.
         """
         with claim(self.folder) if self.ranks.is_first else nullcontext():
-            self._run()
+            logger = RunLogger(self.folder, self.cfg, self.iteration) if self.ranks.is_first else None
+            try:
+                self._run(logger)
+                if finish is not None and logger is not None:
+                    finish(logger)
+            finally:
+                if logger is not None:
+                    logger.close()
 
-    def _run(self) -> None:
-        cfg, first = self.cfg, self.ranks.is_first
+    def _run(self, logger: RunLogger | None) -> None:
+        cfg, first = self.cfg, logger is not None
         if first:
-            OmegaConf.save(cfg, self.folder / "config.yaml")
-        logger = RunLogger(self.folder, cfg, self.iteration) if first else None
+            OmegaConf.save(self._config_of_run(), self.folder / CONFIG_FILE)
+            for path in supersede(self.folder / "checkpoints", self.iteration):
+                print(f"set aside, the run goes on from iteration {self.iteration}: {path}")
         columns = (
             TextColumn("[bold]{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
             TextColumn("{task.fields[numbers]}"),
@@ -243,7 +276,10 @@ class Trainer:
         console = make_console()
         visible = first and console.is_terminal
         try:
-            with Progress(*columns, console=console, refresh_per_second=2, disable=not visible) as progress:
+            with (
+                _deferred_interrupt(self.ranks.size == 1) as interrupted,
+                Progress(*columns, console=console, refresh_per_second=2, disable=not visible) as progress,
+            ):
                 frames_per_iteration = self.frames_per_batch * self.ranks.size
                 total = -(-cfg.total_frames // frames_per_iteration)
                 bar = progress.add_task(self.task.name, total=total, completed=self.iteration, numbers="")
@@ -273,6 +309,8 @@ class Trainer:
                         console.print(f"{self.iteration}/{total} {_headline(row)}", highlight=False)
                     if self.iteration % cfg.checkpoint_interval == 0:
                         self.save()
+                    if interrupted():
+                        raise KeyboardInterrupt
                 if self.ranks.size > 1:
                     self.save()
         finally:
@@ -281,15 +319,21 @@ class Trainer:
                 if self.frames and self.ranks.size == 1:
                     self.save()
             finally:
-                if logger is not None:
-                    logger.close()
                 self.collector.shutdown()
+
+    def _config_of_run(self) -> DictConfig:
+        """The config without what only this call of `train.py` is about: a continued run is the uninterrupted one."""
+        cfg = self.cfg.copy()
+        cfg.resume, cfg.resume_anyway = None, False
+        return cfg
 
     def _evaluate(self) -> dict[str, float]:
         from hdmi.evaluation import evaluate_policy  # evaluation depends on learning, not the other way round
 
         with torch.random.fork_rng():
-            result = evaluate_policy(self.averaged.module, self.cfg, self.cfg.eval_envs, task=self.task)
+            result = evaluate_policy(
+                self.averaged.module, self.cfg, self.cfg.eval_envs, task=self.task, whole_motion=False
+            )
         return {f"eval/{k}": v["mean"] for k, v in result.items() if isinstance(v, dict) and "mean" in v}
 
     # -- checkpoints ------------------------------------------------------------------------------------------
@@ -303,8 +347,9 @@ class Trainer:
         if not self.ranks.is_first:
             return
         state = {
-            "config": OmegaConf.to_container(self.cfg, resolve=True),
+            "config": OmegaConf.to_container(self._config_of_run(), resolve=True),
             "task": self.task.name,
+            "motion": self.motion_digest,
             "sizes": self.sizes,
             "iteration": self.iteration,
             "frames": self.frames,
@@ -324,18 +369,35 @@ class Trainer:
             self.lost_checkpoints += 1
             print(f"checkpoint not written, the previous one stays: {error}", file=sys.stderr)
 
+    def _check_resume(self, state: dict[str, Any]) -> None:
+        """Refuses what cannot be continued, before anything is built."""
+        if "critic" not in state:
+            raise CheckpointError("resume: an exported policy, without critic and optimizers; it cannot be continued")
+        config: Any = OmegaConf.to_container(self.cfg, resolve=True)
+        self._changed = problem_changes(state["config"], config)
+        if self._changed and not self.cfg.resume_anyway:
+            raise CheckpointError(
+                f"resume: {', '.join(self._changed)}: not as in the run, which would be another experiment; leave that "
+                "out, begin a new run, or say resume_anyway=true: networks and optimizers continue, in new episodes"
+            )
+
     def restore(self, state: dict[str, Any]) -> None:
         """Continues from what `save` wrote.
 
+        With `cfg.resume_anyway` and a changed problem, networks, optimizers and counters continue, in new episodes.
+
         Raises:
-            CheckpointError: for an exported policy, and for a checkpoint of another task, of other sizes of
-                observations or actions, or of another number of environments, workers or ranks.
+            CheckpointError: for a checkpoint of another task or motion, of other networks or sizes of observations or
+                actions, or of another number of environments, workers or ranks.
         """
-        if "critic" not in state:
-            raise CheckpointError("resume: an exported policy, without critic and optimizers; it cannot be continued")
-        if state["task"] != self.task.name:
+        if state["task"] != self.task.name and not self._changed:
             raise CheckpointError(
                 f"resume: a checkpoint of task {state['task']!r}, but the config says {self.task.name!r}"
+            )
+        if state.get("motion", self.motion_digest) != self.motion_digest and not self.cfg.resume_anyway:
+            raise CheckpointError(
+                f"resume: the motion {self.cfg.task.motion!r} is not the one of the run; set motion_root=FOLDER to "
+                "where that is, or say resume_anyway=true"
             )
         if state["sizes"] != self.sizes:
             raise CheckpointError(f"resume: the checkpoint has sizes {state['sizes']}, the config {self.sizes}")
@@ -345,15 +407,50 @@ class Trainer:
                 f"there are {self.ranks.size}"
             )
         own = state["ranks"][self.ranks.rank]
-        self.actor.load_state_dict(state["training_actor"])
-        self.averaged.module.load_state_dict(state["actor"])
-        self.critic.load_state_dict(state["critic"])
+        try:
+            self.actor.load_state_dict(state["training_actor"])
+            self.averaged.module.load_state_dict(state["actor"])
+            self.critic.load_state_dict(state["critic"])
+        except RuntimeError as error:
+            raise CheckpointError("resume: the checkpoint's networks are not those of the config's algo") from error
         self.actor_optim.load_state_dict(state["actor_optim"])
         self.critic_optim.load_state_dict(state["critic_optim"])
+        for name, optimizer in (("actor_lr", self.actor_optim), ("critic_lr", self.critic_optim)):
+            if self.cfg.algo[name] != state["config"]["algo"][name]:  # asked for; else as adapted so far
+                for group in optimizer.param_groups:
+                    group["lr"] = self.cfg.algo[name]
         self.iteration, self.frames, self.elapsed = state["iteration"], state["frames"], state["elapsed"]
         self.averaged.n_averaged.fill_(self.iteration)
-        self.collector.load_state_dict(own)
+        if not self._changed:
+            self.collector.load_state_dict(own)
         torch.set_rng_state(own["rng"].cpu())
+
+
+@contextmanager
+def _deferred_interrupt(wanted: bool) -> Iterator[Callable[[], bool]]:
+    """Notes a first Ctrl-C, for the caller to ask for, and passes on a second one.
+
+    Args:
+        wanted: whether to do so; it is not done either where interrupts are handled otherwise.
+    """
+    came = False
+
+    def note(number: int, frame: Any) -> None:
+        nonlocal came
+        if came:
+            raise KeyboardInterrupt
+        came = True
+        os.write(2, b"interrupted: ends after this iteration; once more ends it at once\n")  # print is not reentrant
+
+    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not wanted or not usual or threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: came
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class _Objective(torch.nn.Module):
@@ -371,6 +468,11 @@ class _Objective(torch.nn.Module):
 def _parallel(objective: _Objective) -> DistributedDataParallel:
     # running moments are averaged where they are updated; gradients need not be copied to be reduced
     return DistributedDataParallel(objective, broadcast_buffers=False, gradient_as_bucket_view=True)
+
+
+def _digest(motion: Path) -> str:
+    """Of the files of a motion."""
+    return hashlib.sha256(b"".join((motion / name).read_bytes() for name in ("meta.json", "motion.npz"))).hexdigest()
 
 
 def _recent_mean(mean: Tensor, latest: Tensor, count: Tensor | int, share: float) -> Tensor:

@@ -7,7 +7,7 @@ before them wrote; `HumanoidObjectEnv` applies the rows of the worlds that reset
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -50,6 +50,10 @@ class ModelRandomization(SpecTransform):
         for field in fields:
             values = torch.from_numpy(np.array(getattr(model, field), dtype=np.float32))
             self.register_buffer(f"nominal_{field}", values, persistent=False)
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        self._world_rows = {}  # of another seed
 
     def draw(self, init: TensorDictBase) -> None:
         """Writes into `init` (batch [N]) what this term randomizes."""
