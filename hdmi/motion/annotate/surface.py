@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hdmi.assets import GeomConfig, ObjectConfig
-from hdmi.assets.objects import load_mesh
+from hdmi.assets.mesh import load_mesh
 from hdmi.motion.annotate.solid import Solid
 
 _STEP = 1e-5  # m; of the numerical gradient

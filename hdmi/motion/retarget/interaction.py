@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from hdmi.assets import GeomConfig, ObjectConfig
-from hdmi.assets.objects import load_mesh
+from hdmi.assets.mesh import load_mesh
 from hdmi.motion.annotate.surface import object_surfaces
 from hdmi.motion.human import ObjectTrajectory
 from hdmi.motion.ik import Obstacle

@@ -50,12 +50,15 @@ def validate_motion(
     Args:
         robot: which G1; its feet are taken as four points each whatever they are.
         limits: instead of `LIMITS`.
+
+    Raises:
+        ValueError: if the scene itself cannot be built, which says nothing about the motion.
     """
     # one geom per point of a foot tells a foot that rolls over its toes from one that slides
     robot = replace(robot or RobotConfig(), feet="sphere")
     try:
         playback = make_playback(motion, robot=robot, object=object, scenery=scenery, effectors=effectors)
-    except (MotionError, ValueError) as error:
+    except MotionError as error:
         return unreadable(motion.name, error, motion)
     gap = checks.ground_gap(playback)
     dynamics = inverse_dynamics(playback, gap)
