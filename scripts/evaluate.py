@@ -1,7 +1,7 @@
 """Evaluates a checkpoint by the paper's protocol; prints the figures and writes eval.json.
 
     python scripts/evaluate.py checkpoint=RUN [num_envs=256] [terminations=all] [seed=0] [task=NAME] [sim=cpu|gpu] ...
-    python scripts/evaluate.py agent=zero|random [task=lift_box] ...
+    python scripts/evaluate.py agent=zero|random [task=lift_box] [config_dir=FOLDER] ...
 
 `checkpoint` is a run folder (its newest checkpoint counts) or a checkpoint file. `terminations` are those that end
 an episode as a failure: `all` that the policy was trained with, `none`, or a list such as
@@ -12,8 +12,7 @@ the default config. Its figures, and those of an exported policy, are written on
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 from rich.console import Console
 
@@ -31,10 +30,11 @@ class Options:
     checkpoint: str | None = None
     agent: str | None = None
     num_envs: int = 256
-    terminations: Any = "all"
+    terminations: list[str] = field(default_factory=lambda: ["all"])
     seed: int = 0
     task: str | None = None  # for an agent: lift_box; for a checkpoint: that it must be of
     motion_root: str | None = None  # instead of the training's
+    config_dir: str | None = None  # of an agent's task, where conf/task lacks it
     num_threads: int | None = None  # of physics, instead of the training's
     sim: str | None = None  # engine, cpu or gpu; for a checkpoint: instead of the training's
     out: str | None = None  # file to write; of a run: instead of its eval.json
@@ -43,7 +43,7 @@ class Options:
 def evaluate_agent(options: Options, terminations: list[str] | None) -> EvalResult:
     """Evaluates an agent that needs no training."""
     assert options.agent is not None
-    cfg = task_config(options.task or "lift_box", options.motion_root)
+    cfg = task_config(options.task or "lift_box", options.motion_root, options.config_dir)
     if options.num_threads is not None:
         cfg.num_threads = options.num_threads
     if options.sim is not None:

@@ -423,7 +423,11 @@ class TestMeshes:
             ("thing.urdf", b"<robot/>", "urdf files hold no mesh that is read here; obj, stl, "),
             ("thing.xml", b"<mujoco/>", "xml files hold no mesh"),
             ("thing.usd", b"PXR-USDC", "usd files hold no mesh"),
-            ("tiny.obj", b"v 0 0 0\nv 1e-5 0 0\nv 0 1e-5 0\nv 0 0 1e-5\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n", "no volume"),
+            (
+                "tiny.obj",
+                b"v 0 0 0\nv 1e-5 0 0\nv 0 1e-5 0\nv 0 0 1e-5\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n",
+                "no volume",
+            ),
         ],
     )
     def test_what_is_no_mesh_is_an_error_that_names_the_file(self, tmp_path, name, content, message):

@@ -181,6 +181,8 @@ def make_playback(
     reference = make_reference(motion, control_dt=1 / motion.fps, object=object, scenery=scenery, effectors=effectors)
     for item in scenery:
         if item.name not in reference.placements and item.pos is None:
-            raise MotionError(f"motion {motion.name!r}: body_names lacks {item.name!r}, scenery without a pos in the task")
+            raise MotionError(
+                f"motion {motion.name!r}: body_names lacks {item.name!r}, scenery without a pos in the task"
+            )
     scene = build_scene(robot or RobotConfig(), SimConfig(), object, scenery, effectors, reference.placements)
     return Playback(motion, reference, scene, reference_qpos(scene, reference))

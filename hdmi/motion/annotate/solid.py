@@ -73,7 +73,9 @@ class Solid:
         kept = (faces == given).all(axis=1)
         # what is open keeps the way that most of it faces in the file
         flip = np.where(
-            is_open, np.bincount(patch, area * np.where(kept, 1, -1), count), np.bincount(patch, _volume(corners), count)
+            is_open,
+            np.bincount(patch, area * np.where(kept, 1, -1), count),
+            np.bincount(patch, _volume(corners), count),
         )
         sign = np.where(flip < 0, -1, 1)
         loose = is_open[patch]
