@@ -141,6 +141,12 @@ def scene_parts(cfg: DictConfig) -> dict[str, Any]:
     return parts
 
 
+def contact_tolerance(cfg: DictConfig) -> dict[str, Any]:
+    """How near effectors have to come by the task's interaction reward: `tolerance`, m, and `reduce`, as it has them."""
+    node = cfg.reward.get("interaction")
+    return {key: node[key] for key in ("tolerance", "reduce") if node is not None and key in node}
+
+
 def task_node(cfg: DictConfig, where: str) -> Any:
     """A node of the config that each task has.
 

@@ -3,9 +3,10 @@
     python scripts/annotate.py PATH [task=NAME] [out=FOLDER] [overrides=FILE] [config_dir=FOLDER]
 
 PATH is a motion's folder. `task` describes the object, the scenery and the end effectors: the task whose motion has
-the folder's name, if not given; `config_dir` adds the tasks of its folder `task` to those of conf/task. A file `annotation.yaml` in the folder, or `overrides`, has the last word on intervals
-and points, and may hold keyframes from which the object's trajectory follows. Labels that the motion already has are
-not looked at, but for a comparison. The result goes to `out`, annotated/NAME if not given.
+the folder's name, if not given; `config_dir` adds the tasks of its folder `task` to those of conf/task. A file
+`annotation.yaml` in the folder, or `overrides`, has the last word on intervals and points, and may hold keyframes from
+which the object's trajectory follows. Labels that the motion already has are not looked at, but for a comparison. The
+result goes to `out`, annotated/NAME if not given.
 """
 
 from __future__ import annotations

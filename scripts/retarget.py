@@ -6,7 +6,8 @@
 Formats: `gvhmr` (hmr4d_results.pt; needs source_fps, the video's), `amass` (npz), `omomo` (npz), `intermimic` (pt),
 `bvh` (centimetres and y up unless `unit`, in metres, and `up` say otherwise); guessed from the file if not given.
 `object` is the task that describes the object of the motion, and the end effectors, whose contact labels the source may
-have; `config_dir=FOLDER` adds the tasks of FOLDER/task. Lengths of the scene are scaled so that the person's legs become as long as the robot's, unless `scale` says
+have; `config_dir=FOLDER` adds the tasks of FOLDER/task. Lengths of the scene
+are scaled so that the person's legs become as long as the robot's, unless `scale` says
 otherwise; `height` is the person's, if the file does not tell. What is faster than `cutoff` Hz is taken for noise.
 
 The reference is written to FOLDER (motion.npz, meta.json), with a report beside it (retarget.json). The exit status is

@@ -3,8 +3,8 @@
     python scripts/validate_motion.py PATH [task=NAME] [config_dir=FOLDER] [--json]
 
 PATH is a motion's folder. `task` describes the object, the scenery and the end effectors; without it the task whose
-motion has the folder's name is taken, and `task=none` looks at the robot alone; `config_dir` adds the tasks of its folder
-`task`. `--json` prints the report as JSON.
+motion has the folder's name is taken, and `task=none` looks at the robot alone; `config_dir` adds the tasks of its
+folder `task`. `--json` prints the report as JSON.
 The exit status is 0 for a good or usable motion, 1 for a bad one or one that cannot be read, 2 for wrong arguments.
 """
 
@@ -16,7 +16,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from hdmi.build import scene_parts
+from hdmi.build import contact_tolerance, scene_parts
 from hdmi.cli import run_script
 from hdmi.evaluation.agents import task_config, task_files
 from hdmi.evaluation.options import parse_motion_options
@@ -39,7 +39,10 @@ def report_on(path: Path, task: str | None, config_dir: str | None = None) -> Re
     name = path.resolve().name
     if task is None:
         task = name if name in task_files(config_dir) else "none"
-    parts = {} if task == "none" else scene_parts(task_config(task, config_dir=config_dir))
+    parts = {}
+    if task != "none":
+        cfg = task_config(task, config_dir=config_dir)
+        parts = scene_parts(cfg) | contact_tolerance(cfg)
     try:
         motion = load_motion(path)
     except MotionError as error:

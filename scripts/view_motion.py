@@ -4,7 +4,8 @@
     python scripts/view_motion.py FOLDER viewer=true [task=NAME] [ghost=FOLDER2] [port=8080]
 
 FOLDER holds motion.npz and meta.json. The object, scenery and effectors are those of the task with this motion, or of
-`task`; `config_dir` adds the tasks of its folder `task`. Contact points are yellow while contact is intended. `ghost` is another motion of the same robot, drawn
+`task`; `config_dir` adds the tasks of its folder `task`. Contact points
+are yellow while contact is intended. `ghost` is another motion of the same robot, drawn
 translucent; the viewer plots how far the two are apart. The viewer needs the extra `viewer`.
 """
 

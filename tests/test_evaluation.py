@@ -249,6 +249,23 @@ def gl() -> None:
         pytest.skip(str(error))
 
 
+@pytest.mark.usefixtures("gl")
+@pytest.mark.parametrize("size", [(16, 2560), (1440, 32)])
+def test_pictures_beyond_the_usual_sizes(size: tuple[int, int]):
+    model = lift_box().scene.model
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    renderer = video._renderer(model, (32, 32))
+    assert renderer(model, data, *size).shape == (*size, 3)
+    renderer.close()
+
+
+@pytest.mark.parametrize("size", [(0, 64), (64, -1), (64, 100_000)])
+def test_pictures_of_impossible_sizes(size: tuple[int, int]):
+    with pytest.raises(video.RenderingError, match=f"pictures of {size[1]} x {size[0]} pixels: expected 1 to 8192"):
+        video._renderer(lift_box().scene.model, size)
+
+
 def short(moments: Iterator[video.Moment], count: int = 4) -> Iterator[video.Moment]:
     for moment, _ in zip(moments, range(count), strict=False):
         yield moment

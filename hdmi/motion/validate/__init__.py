@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Literal
 
 from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig
 from hdmi.motion.motion import Motion, MotionError
@@ -41,6 +42,8 @@ def validate_motion(
     scenery: Sequence[SceneryConfig] = (),
     effectors: Sequence[Effector] = (),
     limits: Mapping[str, Limit] = LIMITS,
+    tolerance: float = 0.0,
+    reduce: Literal["mean", "max"] = "mean",
 ) -> Report:
     """Checks a motion in the scene of its task.
 
@@ -50,6 +53,8 @@ def validate_motion(
     Args:
         robot: which G1; its feet are taken as four points each whatever they are.
         limits: instead of `LIMITS`.
+        tolerance: how far from its contact point an effector may be at no cost in the task's interaction reward, m.
+        reduce: the task's, too; `max`: of several effectors that are to touch, the nearest one counts.
 
     Raises:
         ValueError: if the scene itself cannot be built, which says nothing about the motion.
@@ -69,7 +74,7 @@ def validate_motion(
         "torque": checks.torque(dynamics),
         **checks.ground(playback, dynamics, gap),
         **checks.objects(playback, dynamics),
-        **checks.labels(playback),
+        **checks.labels(playback, tolerance, reduce),
     }
     described = [item.name for item in scenery] + ([object.name] if object is not None else [])
     notes = checks.missing_parts(playback, described)
