@@ -142,7 +142,7 @@ def scene_parts(cfg: DictConfig) -> dict[str, Any]:
 
 
 def contact_tolerance(cfg: DictConfig) -> dict[str, Any]:
-    """How near effectors have to come by the task's interaction reward: `tolerance`, m, and `reduce`, as it has them."""
+    """How near effectors have to come by the task's interaction reward: its `tolerance`, m, and `reduce`."""
     node = cfg.reward.get("interaction")
     return {key: node[key] for key in ("tolerance", "reduce") if node is not None and key in node}
 

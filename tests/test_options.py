@@ -88,8 +88,8 @@ def test_values_have_the_declared_type(argument: str, key: str, value: object):
         ("scale=nan", "scale: a number expected, got 'nan'"),
         ("fast=maybe", "fast: true or false expected, got 'maybe'"),
         ("worlds=[8,x]", "worlds: a whole number expected, got 'x'"),
-        ("nmae=x", "unknown option 'nmae'; did you mean name=. there is out, name,"),
-        ("--out=x", "unknown option '--out'; did you mean out="),
+        ("nmae=x", r"unknown option 'nmae' \(did you mean name\?\); there is out, name,"),
+        ("--out=x", r"unknown option '--out' \(did you mean out\?\)"),
         ("runs/a", "'runs/a': expected key=value; the keys are out, name,"),
     ],
 )
@@ -132,7 +132,7 @@ def test_the_motion_is_the_argument_that_is_no_option(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["walk", "nmae=x"], "unknown option 'nmae'; did you mean name="),
+        (["walk", "nmae=x"], r"unknown option 'nmae' \(did you mean name\?\)"),
         (["nmae=x"], "unknown option 'nmae'.*nor is there a folder nmae=x"),
         ([], "give one motion folder, got none"),
         (["name=x"], "give one motion folder, got none"),

@@ -75,8 +75,8 @@ def _keys(cls: type) -> list[str]:
 
 def _unknown(cls: type, key: str) -> str:
     close = difflib.get_close_matches(key.strip("-").replace("-", "_"), _keys(cls), 1)
-    meant = f"did you mean {close[0]}=? " if close else ""
-    return f"unknown option {key!r}; {meant}there is {', '.join(_keys(cls))}"
+    meant = f" (did you mean {close[0]}?)" if close else ""
+    return f"unknown option {key!r}{meant}; there is {', '.join(_keys(cls))}"
 
 
 def _convert(kind: Any, text: str, key: str) -> Any:

@@ -58,11 +58,7 @@ LIMITS: dict[str, Limit] = {
     # labels
     "contact_gap": Limit(0.03, 0.2, "m", "effector away from the object while its label is on", 0.05),
     "contact_point": Limit(
-        0.12,
-        0.4,
-        "m",
-        "effector's point away from its contact point while its label is on, less the task's tolerance",
-        0.05,
+        0.12, 0.4, "m", "effector's point away from its contact point (less the tolerance) while its label is on", 0.05
     ),
     "unlabelled_contact": Limit(0.1, math.inf, "m/s", "object that an effector moves while its label is off", 0.05),
 }
