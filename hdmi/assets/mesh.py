@@ -70,6 +70,7 @@ def _load(file: Path, scale: tuple[float, ...], version: tuple[int, int]) -> tri
 
 def _hull_volume(mesh: trimesh.Trimesh) -> float:
     try:
-        return float(mesh.convex_hull.volume)
+        with np.errstate(all="ignore"):
+            return float(mesh.convex_hull.volume)
     except Exception:  # Qhull's, of points in a plane
         return 0.0
