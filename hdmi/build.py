@@ -11,10 +11,23 @@ import mujoco
 import torch
 from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from rich.table import Table
 from torchrl.envs import CatTensors, Compose, RemoveEmptySpecs, SelectTransform, Transform
 
-from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene, g1, match_names
+from hdmi.assets import (
+    Effector,
+    GeomConfig,
+    ObjectConfig,
+    RobotConfig,
+    Scene,
+    SceneryConfig,
+    SimConfig,
+    build_scene,
+    g1,
+    match_names,
+    parse_geom,
+)
 from hdmi.envs import HumanoidObjectEnv, MaskedResetEnv, PhysicsBackend, RowResetEnv
 from hdmi.motion import Reference, find_motion, make_reference
 
@@ -54,7 +67,10 @@ def build(node: Any, where: str, **context: Any) -> Any:
     Raises:
         ConfigError: for an unknown class or parameter, or values that the class refuses; names the node.
     """
-    values: dict[str, Any] = _container(node) if OmegaConf.is_config(node) else dict(node)
+    try:
+        values: dict[str, Any] = _container(node) if OmegaConf.is_config(node) else dict(node)
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"{where}: {_one_line(error)}") from error
     path = values.pop("_target_", None)
     if path is None:
         raise ConfigError(f"{where}: has no _target_")
@@ -104,16 +120,93 @@ def _dataclass(cls: type, node: Any, where: str) -> Any:
 def scene_parts(cfg: DictConfig) -> dict[str, Any]:
     """What a config says of the scene: `robot`, `object`, `scenery` and `effectors`, as keyword arguments.
 
+    Everything in it has been checked, and compiles: what a task's scene has at fault, its meshes included, is found
+    here, before any motion is looked at.
+
     Raises:
-        ConfigError: for a node that cannot be used.
+        ConfigError: for a node that cannot be used; names it.
     """
-    task = cfg.task
-    return {
+    node = task_node(cfg, "task.object")
+    parts = {
         "robot": _robot(cfg),
-        "object": None if task.object is None else build(task.object, "task.object"),
-        "scenery": [build(item, f"task.scenery[{i}]") for i, item in enumerate(task.scenery)],
-        "effectors": [build(item, f"task.effectors[{i}]") for i, item in enumerate(task.effectors)],
+        "object": None if node is None else _part(ObjectConfig, node, "task.object"),
+        "scenery": _parts_of(SceneryConfig, cfg, "task.scenery"),
+        "effectors": _parts_of(Effector, cfg, "task.effectors"),
     }
+    bodies = [("task.object", parts["object"])] if parts["object"] is not None else []
+    bodies += [(f"task.scenery[{i}]", item) for i, item in enumerate(parts["scenery"])]
+    try:
+        for where, body in bodies:
+            body.check(where)
+        for i, effector in enumerate(parts["effectors"]):
+            effector.check(f"task.effectors[{i}]")
+        _compile(**parts)
+    except (ValueError, FileNotFoundError) as error:
+        raise ConfigError(_one_line(error)) from error
+    return parts
+
+
+def contact_tolerance(cfg: DictConfig) -> dict[str, Any]:
+    """How near effectors have to come by the task's interaction reward: its `tolerance`, m, and `reduce`."""
+    node = cfg.reward.get("interaction")
+    return {key: node[key] for key in ("tolerance", "reduce") if node is not None and key in node}
+
+
+def task_node(cfg: DictConfig, where: str) -> Any:
+    """A node of the config that each task has.
+
+    Raises:
+        ConfigError: if this one lacks it.
+    """
+    node = cfg
+    for key in where.split("."):
+        if node is None or key not in node:
+            nested = "task" in cfg and cfg.task is not None and "task" in cfg.task
+            hint = "; the file's first line has to be `# @package _global_`" if nested else ""
+            raise ConfigError(f"{where}: missing{hint}")
+        try:
+            node = node[key]
+        except OmegaConfBaseException as error:
+            raise ConfigError(f"{where}: {_one_line(error)}") from error
+    return node
+
+
+def _part(cls: type, node: Any, where: str) -> Any:
+    part = build(node, where) if OmegaConf.is_dict(node) else None
+    if not isinstance(part, cls):
+        raise ConfigError(f"{where}: a {cls.__name__} expected, got {node}")
+    return part
+
+
+def _parts_of(cls: type, cfg: DictConfig, where: str) -> list[Any]:
+    node = task_node(cfg, where)
+    if node is not None and not OmegaConf.is_list(node):
+        raise ConfigError(f"{where}: a list expected, got {node}")
+    return [_part(cls, item, f"{where}[{i}]") for i, item in enumerate(node or ())]
+
+
+def _compile(robot: RobotConfig, object: ObjectConfig | None, scenery: Any, effectors: Any) -> None:
+    """Compiles a scene without its motion, with boxes for meshes, which take their time.
+
+    Raises:
+        ValueError: for what only shows when parts come together, such as two bodies of one name.
+    """
+
+    def boxes(body: Any) -> Any:
+        geoms = [parse_geom(geom, "") for geom in body.geoms]
+        geoms = [geom if geom.mesh is None else GeomConfig(box=(0.1, 0.1, 0.1)) for geom in geoms]
+        return replace(body, geoms=geoms)
+
+    if object is not None:
+        hinge = None if object.hinge is None else boxes(object.hinge)
+        object = boxes(replace(object, hinge=hinge))
+    origin = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    placements = {item.name: origin for item in scenery}
+    build_scene(robot, SimConfig(), object, [boxes(item) for item in scenery], effectors, placements)
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 def _robot(cfg: DictConfig) -> RobotConfig:
@@ -138,14 +231,14 @@ def make_task(cfg: DictConfig) -> Task:
     parts = scene_parts(cfg)
     robot = parts.pop("robot")
     sim = _dataclass(SimConfig, {k: v for k, v in cfg.sim.items() if k not in ("device", "backend")}, "sim")
-    task = cfg.task
-    motion = find_motion(task.motion, cfg.motion_root)
+    name = task_node(cfg, "task.name")
+    motion = find_motion(task_node(cfg, "task.motion"), cfg.motion_root)
     reference = make_reference(motion, control_dt=sim.control_dt, robot=robot, **parts)
     try:
         scene = build_scene(robot, sim, **parts, placements=reference.placements)
     except ValueError as error:
-        raise ConfigError(f"task {task.name!r}: {error}") from error
-    return Task(task.name, scene, reference)
+        raise ConfigError(f"task {name!r}: {_one_line(error)}") from error
+    return Task(name, scene, reference)
 
 
 def backend_of(cfg: DictConfig) -> Callable[[mujoco.MjModel, int], PhysicsBackend]:

@@ -1,11 +1,12 @@
 """Finds a motion's contacts with the object, completes the object's trajectory, and writes the annotated motion.
 
-    python scripts/annotate.py PATH [task=NAME] [out=FOLDER] [overrides=FILE]
+    python scripts/annotate.py PATH [task=NAME] [out=FOLDER] [overrides=FILE] [config_dir=FOLDER]
 
 PATH is a motion's folder. `task` describes the object, the scenery and the end effectors: the task whose motion has
-the folder's name, if not given. A file `annotation.yaml` in the folder, or `overrides`, has the last word on intervals
-and points, and may hold keyframes from which the object's trajectory follows. Labels that the motion already has are
-not looked at, but for a comparison. The result goes to `out`, annotated/NAME if not given.
+the folder's name, if not given; `config_dir` adds the tasks of its folder `task` to those of conf/task. A file
+`annotation.yaml` in the folder, or `overrides`, has the last word on intervals and points, and may hold keyframes from
+which the object's trajectory follows. Labels that the motion already has are not looked at, but for a comparison. The
+result goes to `out`, annotated/NAME if not given.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ class Options:
     task: str | None = None
     out: str | None = None
     overrides: str | None = None
+    config_dir: str | None = None
 
 
 def table(motion: Motion, effectors: list[str], given: np.ndarray | None) -> Table:
@@ -65,7 +67,7 @@ def annotate(arguments: list[str], console: Console) -> int:
     """Annotates a motion, writes it, and shows its contacts."""
     path, options = parse_motion_options(Options, arguments)
     motion = load_motion(path)
-    parts = scene_parts(task_config(options.task or motion.name))
+    parts = scene_parts(task_config(options.task or motion.name, config_dir=options.config_dir))
     if parts["object"] is None:
         raise ConfigError(f"task {options.task or motion.name!r}: has no object to touch")
     beside = path / FILE

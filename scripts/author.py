@@ -1,9 +1,10 @@
 """Makes a reference motion from a plan of keyframes, without any recording.
 
-    python scripts/author.py task=NAME [plan=FILE] [out=FOLDER]
+    python scripts/author.py task=NAME [plan=FILE] [out=FOLDER] [config_dir=FOLDER]
 
 The plan is the one that ships for the task unless `plan` names a file; what it may hold is in docs/authoring.md and
-hdmi/motion/author/plan.py. Object, scenery and end effectors are the task's. The motion is written to `out`/<plan's
+hdmi/motion/author/plan.py. Object, scenery and end effectors are the task's, which
+`config_dir`/task may have instead of conf/task. The motion is written to `out`/<plan's
 name>, `motions` if absent, so that `python train.py task=NAME motion_root=motions` trains on it.
 """
 
@@ -32,13 +33,14 @@ class Options:
     task: str | None = None
     plan: str | None = None
     out: str = "motions"
+    config_dir: str | None = None
 
 
 def author(options: Options, console: Console) -> tuple[Authored, Path]:
     """Solves the plan and writes the motion; returns what came out and its folder."""
     if options.task is None:
         raise ConfigError("give task=NAME")
-    parts = scene_parts(task_config(options.task))
+    parts = scene_parts(task_config(options.task, config_dir=options.config_dir))
     plan = load_plan(options.plan or find_plan(options.task))
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         bar = progress.add_task(plan.name, total=None)

@@ -1,7 +1,7 @@
 """Evaluates a checkpoint by the paper's protocol; prints the figures and writes eval.json.
 
     python scripts/evaluate.py checkpoint=RUN [num_envs=256] [without=[NAME,...]] [terminations=all] [seed=0] ...
-    python scripts/evaluate.py agent=zero|random [task=lift_box] ...
+    python scripts/evaluate.py agent=zero|random [task=lift_box] [config_dir=FOLDER] ...
 
 `checkpoint` is a run folder (its newest checkpoint counts) or a checkpoint file. `terminations` are those that end
 an episode as a failure: `all` that the policy was trained with, `none`, or a list such as
@@ -15,8 +15,7 @@ figures, and those of an exported policy, are written only where `out` says.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 from rich.console import Console
 
@@ -24,7 +23,7 @@ from hdmi.build import ConfigError, make_task
 from hdmi.cli import run_script
 from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy
 from hdmi.evaluation.agents import AGENTS, blind_agent, choose_engine, task_config
-from hdmi.evaluation.options import parse_names, parse_options, parse_terminations
+from hdmi.evaluation.options import parse_options, parse_terminations
 
 
 @dataclass
@@ -34,11 +33,12 @@ class Options:
     checkpoint: str | None = None
     agent: str | None = None
     num_envs: int = 256
-    terminations: Any = "all"
-    without: Any = None  # names of terminations
+    terminations: list[str] = field(default_factory=lambda: ["all"])
+    without: list[str] = field(default_factory=list)  # names of terminations
     seed: int = 0
     task: str | None = None  # for an agent: lift_box; for a checkpoint: that it must be of
     motion_root: str | None = None  # instead of the training's
+    config_dir: str | None = None  # of an agent's task, where conf/task lacks it
     num_threads: int | None = None  # of physics, instead of the training's
     sim: str | None = None  # engine, cpu or gpu; for a checkpoint: instead of the training's
     out: str | None = None  # file to write; of a run: instead of its eval.json
@@ -46,9 +46,8 @@ class Options:
 
 def evaluate_agent(options: Options, terminations: list[str] | None, without: list[str]) -> EvalResult:
     """Evaluates an agent that needs no training."""
-    if options.agent not in AGENTS:
-        raise ConfigError(f"agent: there is no {options.agent!r}; there is {', '.join(AGENTS)}")
-    cfg = task_config(options.task or "lift_box", options.motion_root)
+    assert options.agent is not None
+    cfg = task_config(options.task or "lift_box", options.motion_root, options.config_dir)
     if options.num_threads is not None:
         cfg.num_threads = options.num_threads
     if options.sim is not None:
@@ -68,7 +67,7 @@ def evaluate(arguments: list[str], console: Console) -> int:
         raise ConfigError(f"give either checkpoint=RUN or agent=, one of {', '.join(AGENTS)}")
     if options.num_envs < 1:
         raise ConfigError(f"num_envs: expected at least 1, got {options.num_envs}")
-    terminations, without = parse_terminations(options.terminations), parse_names(options.without)
+    terminations, without = parse_terminations(options.terminations), options.without
     if options.checkpoint is None:
         result = evaluate_agent(options, terminations, without)
     else:

@@ -1,7 +1,7 @@
 """Plays a policy, or an agent that needs none, and writes a video or opens a window.
 
     python scripts/play.py checkpoint=RUN [start=FRAME] [out=play.mp4] [window=true]
-    python scripts/play.py agent=zero|random|reference [task=lift_box] ...
+    python scripts/play.py agent=zero|random|reference [task=lift_box] [config_dir=FOLDER] ...
 
 `zero` and `random` act on the environment of the default config; `reference` shows the motion without physics. The
 reference is drawn as a ghost, contact points are yellow while contact is intended, contact forces are red. The video
@@ -34,6 +34,7 @@ class Options:
     agent: str | None = None
     task: str | None = None  # for an agent: lift_box; for a checkpoint: that it must be of
     motion_root: str | None = None
+    config_dir: str | None = None  # of an agent's task, where conf/task lacks it
     start: int = 0  # frame of the reference
     seed: int = 0
     out: str | None = None  # play.mp4 in the run folder, or play_<task>_<agent>.mp4 here
@@ -62,7 +63,7 @@ def prepare(options: Options) -> tuple[Task, Iterator[Moment], Path]:
     else:
         if options.agent not in (agents := (*AGENTS, "reference")):
             raise ConfigError(f"agent: there is no {options.agent!r}; there is {', '.join(agents)}")
-        cfg = task_config(options.task or "lift_box", options.motion_root)
+        cfg = task_config(options.task or "lift_box", options.motion_root, options.config_dir)
         out = Path(f"play_{cfg.task.name}_{options.agent}.mp4")
     task = make_task(cfg)
     if options.agent in AGENTS:

@@ -11,7 +11,8 @@ lowest sole onto the ground or to `keep` its height (shifted if more than 5 cm o
 with SMPL's names by the file's (`Bip01_L_Thigh: left_hip`), and `angles` may be `radians`. The report has notes of what
 was changed or not used.
 `object` is the task that describes the object of the motion, and the end effectors, whose contact labels the source may
-have. Lengths of the scene are scaled so that the person's legs become as long as the robot's, unless `scale` says
+have; `config_dir=FOLDER` adds the tasks of FOLDER/task. Lengths of the scene
+are scaled so that the person's legs become as long as the robot's, unless `scale` says
 otherwise; `height` is the person's, if the file does not tell. What is faster than `cutoff` Hz is taken for noise.
 
 The reference is written to FOLDER (motion.npz, meta.json), with a report beside it (retarget.json). The exit status is
@@ -47,6 +48,7 @@ class Options:
     out: str | None = None
     format: str | None = None
     object: str | None = None
+    config_dir: str | None = None  # of the task, where conf/task lacks it
     name: str | None = None
     height: float | None = None
     source_fps: float | None = None
@@ -69,6 +71,9 @@ def run(options: Options, console: Console) -> tuple[Path, RetargetReport]:
     for key in ("fps", "cutoff", "scale"):
         if (value := getattr(options, key)) is not None and not value > 0:
             raise ConfigError(f"{key}: expected more than 0, got {value:g}")
+    parts: dict[str, Any] = {}
+    if options.object is not None:
+        parts = scene_parts(task_config(options.object, config_dir=options.config_dir))
     human = read_person(
         options.source,
         options.format,
@@ -82,7 +87,6 @@ def run(options: Options, console: Console) -> tuple[Path, RetargetReport]:
         ground=options.ground,
     )
     human = replace(human, name=options.name or Path(options.out).name)
-    parts: dict[str, Any] = {} if options.object is None else scene_parts(task_config(options.object))
     how = RetargetOptions(
         fps=options.fps,
         cutoff=options.cutoff,

@@ -1,10 +1,11 @@
 """Lists the tasks, checks them, or renders a picture of each.
 
-    python scripts/tasks.py [motion_root=FOLDER]
-    python scripts/tasks.py check [NAME ...] [frames=65536] [num_envs=128] [jobs=2] [motion_root=FOLDER]
-    python scripts/tasks.py gallery [NAME ...] [out=docs/images/tasks] [motion_root=FOLDER]
+    python scripts/tasks.py [motion_root=FOLDER] [config_dir=FOLDER]
+    python scripts/tasks.py check [NAME ...] [frames=65536] [num_envs=128] [jobs=2] [motion_root=FOLDER] ...
+    python scripts/tasks.py gallery [NAME ...] [out=docs/images/tasks] [motion_root=FOLDER] ...
 
-References are those that ship with the package, or those under `motion_root`. `check` builds each task, replays its
+References are those that ship with the package, or those under `motion_root`. `config_dir` adds the tasks of its folder
+`task`. `check` builds each task, replays its
 reference to see whether end effectors meet the object where labels say, follows it without a policy and trains for
 `frames` control steps (0: does not), which has to improve the return of the policy with its exploration noise, `jobs`
 tasks at a time on one processor each. Its exit status is 1 if a task fails. Without names it checks all tasks, with
@@ -22,9 +23,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from hdmi.build import ConfigError, make_task
+from hdmi.build import ConfigError, make_task, scene_parts
 from hdmi.cli import run_script
-from hdmi.evaluation.agents import task_config, task_names
+from hdmi.evaluation.agents import task_config, task_files
 from hdmi.evaluation.options import parse_options
 from hdmi.evaluation.tasks import TaskCheck, check_table, check_task, list_tasks, render_reference, sources
 from hdmi.motion import MotionError
@@ -35,28 +36,32 @@ class Options:
     """See the module."""
 
     motion_root: str | None = None
+    config_dir: str | None = None
     frames: int = 65_536
     num_envs: int = 128
     jobs: int = 2
     out: str = "docs/images/tasks"
 
 
-def chosen(names: list[str], motion_root: str | None) -> list[str]:
+def chosen(names: list[str], motion_root: str | None, config_dir: str | None) -> list[str]:
     """The named tasks; without names all of them, or those with a motion under `motion_root`."""
     if names or motion_root is None:
-        return names or task_names()
-    return [name for name in task_names() if "motion_root" in sources(task_config(name), motion_root)]
+        return names or list(task_files(config_dir))
+    configs = {name: task_config(name, motion_root, config_dir) for name in task_files(config_dir)}
+    return [name for name, cfg in configs.items() if "motion_root" in sources(cfg, motion_root)]
 
 
 def check(names: list[str], options: Options, console: Console) -> int:
     """Checks tasks; those whose motion cannot be used fail, too."""
-    names = chosen(names, options.motion_root)
+    names = chosen(names, options.motion_root, options.config_dir)
     if not names:
         raise ConfigError(f"motion_root: no task has its motion under {options.motion_root}")
+    for name in names:  # before others have trained
+        scene_parts(task_config(name, options.motion_root, options.config_dir))
     checks: dict[str, TaskCheck] = {}
     spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
     with ProcessPoolExecutor(min(options.jobs, len(names)), spawn, initializer=_quiet) as pool:
-        options_of = (options.motion_root, options.frames, options.num_envs, 1)
+        options_of = (options.motion_root, options.frames, options.num_envs, 1, options.config_dir)
         futures = {pool.submit(check_task, name, *options_of): name for name in names}
         for future in as_completed(futures):
             name = futures[future]
@@ -77,9 +82,9 @@ def _quiet() -> None:
 
 def gallery(names: list[str], options: Options, console: Console) -> int:
     """Renders pictures of tasks."""
-    for name in chosen(names, options.motion_root):
+    for name in chosen(names, options.motion_root, options.config_dir):
         try:
-            task = make_task(task_config(name, options.motion_root))
+            task = make_task(task_config(name, options.motion_root, options.config_dir))
         except MotionError as error:
             if names:
                 raise
@@ -97,7 +102,7 @@ def command(arguments: list[str], console: Console) -> int:
         if getattr(options, key) < 1:
             raise ConfigError(f"{key}: expected at least 1, got {getattr(options, key)}")
     if not words:
-        console.print(list_tasks(options.motion_root))
+        console.print(list_tasks(options.motion_root, options.config_dir))
         return 0
     commands = {"check": check, "gallery": gallery}
     if words[0] not in commands:

@@ -4,7 +4,8 @@
     python scripts/view_motion.py FOLDER viewer=true [task=NAME] [ghost=FOLDER2] [port=8080]
 
 FOLDER holds motion.npz and meta.json. The object, scenery and effectors are those of the task with this motion, or of
-`task`. Contact points are yellow while contact is intended. `ghost` is another motion of the same robot, drawn
+`task`; `config_dir` adds the tasks of its folder `task`. Contact points
+are yellow while contact is intended. `ghost` is another motion of the same robot, drawn
 translucent; the viewer plots how far the two are apart. The viewer needs the extra `viewer`.
 """
 
@@ -31,6 +32,7 @@ class Options:
 
     out: str | None = None  # <name of the motion>.mp4 here
     task: str | None = None
+    config_dir: str | None = None
     ghost: str | None = None
     viewer: bool = False
     host: str = "127.0.0.1"
@@ -52,13 +54,13 @@ def view(arguments: list[str], console: Console) -> int:
     for name in ("stride", "width", "height"):
         if getattr(options, name) < 1:
             raise ConfigError(f"{name}: expected at least 1, got {getattr(options, name)}")
-    playback, taken = load_view(path, options.task)
+    playback, taken = load_view(path, options.task, options.config_dir)
     last = playback.num_frames - 1
     if not 0 <= options.start < last:
         raise ConfigError(f"start: expected a frame from 0 to {last - 1}, got {options.start}")
     name = playback.motion.name
     console.print(f"{name}: {last + 1} frames at {playback.fps:g} fps, {taken}", highlight=False, soft_wrap=True)
-    ghost = None if options.ghost is None else load_view(options.ghost, options.task)[0]
+    ghost = None if options.ghost is None else load_view(options.ghost, options.task, options.config_dir)[0]
     if options.viewer:
         viewer = ReferenceViewer(playback, ghost, options.host, options.port)
         console.print(f"open {viewer.address} (Ctrl+C ends it)", highlight=False, soft_wrap=True)

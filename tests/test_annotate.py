@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -33,6 +34,7 @@ from hdmi.motion.annotate import (
     object_surfaces,
 )
 from hdmi.motion.annotate.contacts import _label
+from hdmi.motion.annotate.solid import Solid
 
 QUARTER = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # about z
 LEFT, RIGHT = "left_wrist_yaw_link", "right_wrist_yaw_link"
@@ -68,7 +70,7 @@ class TestSurface:
         assert Surface([GeomConfig(**geom)]).distance(np.array(point)) == pytest.approx(distance)
 
     def test_meshes_are_not_their_hulls(self, tmp_path):
-        pytest.importorskip("rtree")
+        pytest.importorskip("igl")
         ring = trimesh.creation.annulus(r_min=0.2, r_max=0.3, height=0.1)
         ring.export(tmp_path / "ring.stl")
         surface = Surface([GeomConfig(mesh=str(tmp_path / "ring.stl"))])
@@ -96,6 +98,86 @@ class TestSurface:
             "door", [{"sphere": 0.1}], hinge=HingeConfig("door_joint", "panel", [{"box": (0.02, 0.5, 1.0)}])
         )
         assert list(object_surfaces(door)) == ["door", "panel"]
+
+
+def crate(change: str) -> trimesh.Trimesh:
+    """A box of half extents 0.12, 0.14 and 0.10 m, whose triangles are ordered in some way or other."""
+    box = trimesh.creation.box((0.24, 0.28, 0.20)).subdivide()
+    faces, turned = np.array(box.faces), box.faces[:, ::-1]
+    some = np.random.default_rng(0).random(len(faces)) < 0.4
+    if change == "inverted":
+        faces = turned
+    elif change == "mixed":
+        faces[some] = turned[some]
+    elif change == "doubled":
+        faces = np.concatenate([faces, turned])
+    elif change == "bottomless, inverted":
+        faces = turned[box.triangles_center[:, 2] > -0.099]
+    elif change == "bottomless":
+        faces = faces[box.triangles_center[:, 2] > -0.099]
+    out = trimesh.Trimesh(box.vertices, faces, process=False)
+    if change == "no shared corners":  # as texture seams leave it
+        faces[some] = turned[some]
+        corners = box.vertices[faces].reshape(-1, 3)
+        out = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+    elif change == "loose sides, inverted":
+        corners = box.vertices[faces[:, ::-1]] + 1e-4 * box.face_normals[:, None]
+        out = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), process=False)
+    return out
+
+
+class TestSolid:
+    @pytest.fixture(autouse=True)
+    def _igl(self):
+        pytest.importorskip("igl")
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            "none",
+            "inverted",
+            "mixed",
+            "doubled",
+            "no shared corners",
+            "loose sides, inverted",
+            "bottomless",
+            "bottomless, inverted",
+        ],
+    )
+    def test_order_of_triangles_does_not_matter(self, change):
+        points = np.random.default_rng(1).uniform(-0.25, 0.25, (500, 3))
+        expected = Surface([GeomConfig(box=(0.12, 0.14, 0.10))]).distance(points)
+        if "bottomless" in change:  # nothing is near where the bottom was
+            points, expected = points[points[:, 2] > 0.0], expected[points[:, 2] > 0.0]
+        distance, nearest = Solid(crate(change)).nearest(points)
+        np.testing.assert_allclose(distance, expected, atol=2e-4)
+        np.testing.assert_allclose(np.linalg.norm(points - nearest, axis=-1), np.abs(expected), atol=2e-4)
+
+    def test_each_shell_is_solid_whichever_way_it_faces(self):
+        left, right = trimesh.creation.icosphere(radius=0.1), trimesh.creation.icosphere(radius=0.1)
+        right.apply_translation([0.15, 0.0, 0.0])  # they overlap
+        right.invert()
+        solid = Solid(trimesh.util.concatenate([left, right]))
+        distance, _ = solid.nearest(np.array([[0.0, 0, 0], [0.075, 0, 0], [0.15, 0, 0], [0.35, 0, 0], [-0.2, 0, 0]]))
+        assert (distance < 0).tolist() == [True, True, True, False, False]
+
+    def test_memory_does_not_grow_with_points_times_faces(self):
+        ball = trimesh.creation.icosphere(subdivisions=6, radius=0.1)  # 81,920 faces
+        points = np.random.default_rng(0).normal(size=(20_000, 3))
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        distance, _ = Solid(ball).nearest(points)
+        grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 2**20  # GiB on Linux
+        np.testing.assert_allclose(distance, np.linalg.norm(points, axis=-1) - 0.1, atol=1e-4)
+        assert grown < 1.0  # a byte for each pair would be 1.5
+
+    def test_labels_of_a_mesh_are_those_of_its_box(self, tmp_path):
+        parts = scene_parts(task_config("lift_box"))
+        motion, found = load_motion(find_motion("lift_box")), []
+        crate("inverted").export(tmp_path / "crate.obj")
+        for geom in ({"box": (0.12, 0.14, 0.10)}, {"mesh": str(tmp_path / "crate.obj")}):
+            found.append(annotate_motion(motion, **parts | {"object": replace(parts["object"], geoms=[geom])}))
+        np.testing.assert_array_equal(found[0].object_contact, found[1].object_contact)
+        np.testing.assert_allclose(found[0].contact_points, found[1].contact_points, atol=1e-5)
 
 
 def hands(seed: int, num_frames: int = 40, count: int = 2) -> tuple[np.ndarray, np.ndarray, Rotation, np.ndarray]:

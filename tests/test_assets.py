@@ -1,6 +1,7 @@
 """The robot, objects and scenes as MuJoCo compiles them."""
 
 import math
+import os
 
 import mujoco
 import numpy as np
@@ -21,6 +22,7 @@ from hdmi.assets import (
     match_names,
     per_joint,
 )
+from hdmi.assets.mesh import load_mesh
 from hdmi.motion import forward_kinematics
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -301,7 +303,7 @@ class TestObjects:
 
     @pytest.mark.parametrize("mass", [0.0, -1.0, float("nan")])
     def test_bad_mass_is_an_error(self, mass):
-        with pytest.raises(ValueError, match="'crate': mass must be positive"):
+        with pytest.raises(ValueError, match="'crate': mass: 1 positive number"):
             ObjectConfig("crate", [BOX], mass=mass)
 
     @pytest.mark.parametrize(
@@ -313,10 +315,16 @@ class TestObjects:
             {"box": (0.1, 0.1, 0.1, 0.1)},
             {"sphere": -0.1},
             {"capsule": (0.1, -0.2)},
+            {"sphere": "wide"},
+            {"bocks": (0.1, 0.1, 0.1)},
+            {"box": (0.1, 0.1, 0.1), "pos": (0, 0)},
+            {"box": (0.1, 0.1, 0.1), "quat": (0, 0, 0, 0)},
+            {"box": (0.1, 0.1, float("inf"))},
+            "box",
         ],
     )
     def test_bad_geom_is_an_error_that_names_it(self, geom):
-        with pytest.raises(ValueError, match="crate geom 1"):
+        with pytest.raises(ValueError, match=r"crate: geoms\[1\]"):
             scene_with(ObjectConfig("crate", [BOX, geom]))
 
 
@@ -400,8 +408,49 @@ class TestMeshes:
     def test_flat_mesh_is_an_error(self, tmp_path):
         square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [1, 3, 2]], process=False)
         square.export(tmp_path / "square.obj")
-        with pytest.raises(ValueError, match=r"square.obj encloses no volume"):
+        with pytest.raises(ValueError, match=r"square.obj: encloses no volume"):
             scene_with(ObjectConfig("crate", [{"mesh": str(tmp_path / "square.obj")}]))
+
+    @pytest.mark.parametrize(
+        ("name", "content", "message"),
+        [
+            ("points.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "holds no faces"),
+            ("empty.stl", b"", "no faces|cannot be read as a mesh"),
+            ("noise.glb", bytes(range(256)), "cannot be read as a mesh"),
+            ("index.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "cannot be read as a mesh"),
+            ("nan.obj", b"v 0 0 0\nv 1 0 nan\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n", "not finite"),
+            ("pointer.obj", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "git lfs pull"),
+            ("thing.urdf", b"<robot/>", "urdf files hold no mesh that is read here; obj, stl, "),
+            ("thing.xml", b"<mujoco/>", "xml files hold no mesh"),
+            ("thing.usd", b"PXR-USDC", "usd files hold no mesh"),
+            (
+                "tiny.obj",
+                b"v 0 0 0\nv 1e-5 0 0\nv 0 1e-5 0\nv 0 0 1e-5\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n",
+                "no volume",
+            ),
+        ],
+    )
+    def test_what_is_no_mesh_is_an_error_that_names_the_file(self, tmp_path, name, content, message):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=f"{name}: .*({message})"):
+            load_mesh(str(tmp_path / name))
+
+    @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), (1.0, 2.0), "big"])
+    def test_bad_scale_is_an_error(self, egg, scale):
+        with pytest.raises(ValueError, match="scale: one positive figure or three"):
+            load_mesh(str(egg), scale)
+
+    @pytest.mark.parametrize("kind", ["obj", "stl", "ply", "off", "glb"])
+    def test_formats(self, tmp_path, kind):
+        trimesh.creation.box((0.2, 0.3, 0.4)).export(tmp_path / f"box.{kind}")
+        assert load_mesh(str(tmp_path / f"box.{kind}"), (1, 1, 2)).volume == pytest.approx(2 * 0.024, rel=1e-5)
+
+    def test_a_changed_file_is_read_again(self, tmp_path):
+        path = tmp_path / "box.obj"
+        for size in (0.2, 0.3):
+            trimesh.creation.box((size, size, size)).export(path)
+            os.utime(path, (1, size * 1e6))
+            assert load_mesh(str(path)).volume == pytest.approx(size**3)
 
 
 class TestScene:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import imageio.v2 as imageio
+import mujoco
 import pytest
 import torch
 from mocks import lift_box, load_config
@@ -19,7 +19,6 @@ from tensordict import TensorDict
 from hdmi.build import ConfigError, make_env
 from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy, protocol, render_checkpoint, video
 from hdmi.evaluation.agents import BlindAgent, blind_agent
-from hdmi.evaluation.options import parse_names, parse_options, parse_terminations
 from hdmi.evaluation.protocol import FirstEpisodes, StartAtFrame, evaluation_config, termination_names
 from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from hdmi.learning.policy import load_policy, make_networks
@@ -295,6 +294,23 @@ def gl() -> None:
         pytest.skip(str(error))
 
 
+@pytest.mark.usefixtures("gl")
+@pytest.mark.parametrize("size", [(16, 2560), (1440, 32)])
+def test_pictures_beyond_the_usual_sizes(size: tuple[int, int]):
+    model = lift_box().scene.model
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    renderer = video._renderer(model, (32, 32))
+    assert renderer(model, data, *size).shape == (*size, 3)
+    renderer.close()
+
+
+@pytest.mark.parametrize("size", [(0, 64), (64, -1), (64, 100_000)])
+def test_pictures_of_impossible_sizes(size: tuple[int, int]):
+    with pytest.raises(video.RenderingError, match=f"pictures of {size[1]} x {size[0]} pixels: expected 1 to 8192"):
+        video._renderer(lift_box().scene.model, size)
+
+
 def short(moments: Iterator[video.Moment], count: int = 4) -> Iterator[video.Moment]:
     for moment, _ in zip(moments, range(count), strict=False):
         yield moment
@@ -434,33 +450,7 @@ def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert "needs a display" in capsys.readouterr().err
 
 
-# -- options --------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class Options:
-    checkpoint: str | None = None
-    num_envs: int = 4
-
-
-def test_options_are_checked():
-    assert parse_options(Options, ["checkpoint=a/b", "num_envs=8"]) == Options("a/b", 8)
-    with pytest.raises(ConfigError, match="unknown option 'envs'; there is checkpoint, num_envs"):
-        parse_options(Options, ["envs=3"])
-    with pytest.raises(ConfigError, match="expected key=value"):
-        parse_options(Options, ["runs/a"])
-    with pytest.raises(ConfigError, match="num_envs"):
-        parse_options(Options, ["num_envs=many"])
-
-
-def test_termination_choices():
-    assert parse_terminations("all") is None
-    assert parse_terminations("none") == []
-    assert parse_terminations(["a", "b"]) == ["a", "b"]
-    assert parse_terminations("a") == ["a"]
-    assert parse_names(None) == []
-    assert parse_names("lost_contact") == ["lost_contact"]
-    assert parse_names(["a", "all"]) == ["a", "all"]
+# -- mistakes ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from torchrl.envs.utils import ExplorationType, check_env_specs, exploration_typ
 
 from hdmi.assets import default_joint_pos, g1
 from hdmi.build import ConfigError, Task, make_env, make_task, make_transforms, scene_parts
-from hdmi.evaluation.agents import BlindAgent, task_names
+from hdmi.evaluation.agents import BlindAgent, task_files
 from hdmi.evaluation.tasks import (
     Training,
     check_task,
@@ -39,7 +39,7 @@ from hdmi.motion import Motion, find_motion, forward_kinematics, load_motion, sa
 from hdmi.motion.validate import validate_motion
 
 ROOT = CONF.parent
-TASKS = task_names()
+TASKS = list(task_files())
 PAPER = {
     "move_suitcase", "push_box", "carry_bread_box", "move_foam", "push_door_hand", "open_door_feet", "traverse_door",
     "open_foldchair_sit", "topple_wood_board", "roll_ball", "move_stool", "lift_box_over_shoulder", "truman_bow",

@@ -345,6 +345,24 @@ class TestObject:
         assert finding.value == pytest.approx(0.25, abs=0.01)
         assert finding.faults[0].part == "left_wrist_yaw_link"
 
+    @pytest.mark.parametrize(
+        ("tolerance", "value"), [({"tolerance": 0.2}, 0.05), ({"reduce": "max"}, 0.02), ({"tolerance": 0.3}, 0.0)]
+    )
+    def test_contact_point_within_the_tolerance_of_the_task(self, lift_box, tolerance, value):
+        motion, scene = lift_box
+        left, right = scene["effectors"]
+        x, y, z = left.target
+        effectors = [replace(left, target=(x, y, z + 0.25)), right]
+        motion = replace(motion, contact_points=None)
+        report = validate_motion(motion, **{**scene, "effectors": effectors}, **tolerance)
+        assert report["contact_point"].value == pytest.approx(value, abs=0.01)
+
+    def test_a_fault_of_the_scene_is_no_verdict_on_the_motion(self, lift_box):
+        motion, scene = lift_box
+        box = replace(scene["object"], geoms=[{"box": (0.1, 0.1)}])
+        with pytest.raises(ValueError, match=r"geoms\[0\].box: 3 positive numbers"):
+            validate_motion(motion, **{**scene, "object": box})
+
     def test_wrong_task_is_named(self, lift_box):
         motion, _ = lift_box
         scene = {"object": ObjectConfig("vase", [{"sphere": 0.1}]), "effectors": [Effector("left_wrist_yaw_link")]}
@@ -410,6 +428,17 @@ class TestScript:
         report = json.loads(capsys.readouterr().out)
         assert (report["verdict"], report["motion"], report["num_frames"]) == ("good", "lift_box", 300)
         assert {finding["check"] for finding in report["findings"]} == set(LIMITS)
+
+    def test_tolerance_of_the_task_counts(self, script, tmp_path):
+        """Hands that roll a ball are far from its points, and the task lets them be."""
+        motion = replace(load_motion(find_motion("roll_ball")), contact_points=None)
+        save_motion(motion, tmp_path / "roll_ball")
+        strict = validate_motion(motion, **scene_parts(task_config("roll_ball")))["contact_point"]
+        assert strict.verdict == "bad"
+        report = script.report_on(tmp_path / "roll_ball", None)
+        assert report["contact_point"].verdict == "good"
+        assert report["contact_point"].value == pytest.approx(strict.value - 0.4, abs=0.1)
+        assert report.verdict != "bad"
 
     def test_bad_motion(self, script, tmp_path, capsys):
         save_motion(moved(x=within(30, 59, 0.4)), tmp_path / "jumpy")

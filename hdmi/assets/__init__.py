@@ -1,7 +1,7 @@
 """Robot and object models, built with MjSpec from plain tables of figures."""
 
 from hdmi.assets import g1
-from hdmi.assets.objects import GeomConfig, HingeConfig, ObjectConfig, SceneryConfig
+from hdmi.assets.objects import GeomConfig, HingeConfig, ObjectConfig, SceneryConfig, parse_geom
 from hdmi.assets.robot import RobotConfig, default_joint_pos, match_names, per_joint
 from hdmi.assets.scene import Effector, Scene, SimConfig, build_scene
 
@@ -18,5 +18,6 @@ __all__ = [
     "default_joint_pos",
     "g1",
     "match_names",
+    "parse_geom",
     "per_joint",
 ]

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, Literal
 
 import mujoco
 import numpy as np
-import trimesh
 
+from hdmi.assets.mesh import load_mesh
 from hdmi.assets.robot import ROBOT_BIT, WORLD_BIT
 
 _IDENTITY = (1.0, 0.0, 0.0, 0.0)
@@ -24,7 +23,7 @@ class GeomConfig:
         box: half extents, m. [3]
         sphere: radius, m.
         capsule, cylinder: radius and half length along z, m. [2]
-        mesh: path of a file that trimesh reads (OBJ, STL, PLY, GLB); collides as its convex hull.
+        mesh: path of an OBJ, STL, PLY, OFF, GLB or glTF file; collides as its convex hull.
         scale: of the mesh, one figure or three.
         pos, quat: of the geom in the body frame, m and wxyz.
         body_quat: rotates pos and quat about the body's origin (for a body frame that is tilted in the source).
@@ -66,6 +65,17 @@ class HingeConfig:
     friction: float = 0.1
     damping: float = 0.1
 
+    def check(self, where: str) -> None:
+        """Raises a ValueError that names the field for what cannot be used."""
+        _check_geoms(self.geoms, where)
+        for key, count in {"pos": 3, "quat": 4, "axis": 3, "range": 2, "friction": 1, "damping": 1}.items():
+            check_numbers(getattr(self, key), count, f"{where}.{key}")
+        low, high = np.asarray(self.range, float)
+        if not low < high:
+            raise ValueError(f"{where}.range: the lower angle first, got {self.range!r}")
+        if not np.any(np.asarray(self.axis, float)):
+            raise ValueError(f"{where}.axis: a direction expected, got {self.axis!r}")
+
 
 @dataclass(frozen=True)
 class ObjectConfig:
@@ -98,14 +108,21 @@ class ObjectConfig:
     def __post_init__(self) -> None:
         if not self.geoms and self.hinge is None:
             raise ValueError(f"object {self.name!r}: has no geoms")
-        if not (self.mass > 0 and np.isfinite(self.mass)):
-            raise ValueError(f"object {self.name!r}: mass must be positive, got {self.mass}")
+        check_numbers(self.mass, 1, f"object {self.name!r}: mass", positive=True)
         if self.friction_combine not in ("max", "object"):
             raise ValueError(
                 f"object {self.name!r}: friction_combine is 'max' or 'object', got {self.friction_combine!r}"
             )
         if self.hinge is not None and not isinstance(self.hinge, HingeConfig):
-            object.__setattr__(self, "hinge", HingeConfig(**self.hinge))
+            object.__setattr__(self, "hinge", _from_mapping(HingeConfig, self.hinge, "hinge"))
+
+    def check(self, where: str) -> None:
+        """Reads meshes; raises a ValueError that names the field for what cannot be used."""
+        _check_geoms(self.geoms, where, needed=self.hinge is None)
+        for key, count in {"mass": 1, "friction": 1, "torsional_friction": 1, "rgba": 4}.items():
+            check_numbers(getattr(self, key), count, f"{where}.{key}")
+        if self.hinge is not None:
+            self.hinge.check(f"{where}.hinge")
 
     @property
     def link(self) -> str:
@@ -129,6 +146,12 @@ class SceneryConfig:
     quat: Sequence[float] = _IDENTITY
     rgba: Sequence[float] = (0.55, 0.58, 0.62, 1.0)
 
+    def check(self, where: str) -> None:
+        """Reads meshes; raises a ValueError that names the field for what cannot be used."""
+        _check_geoms(self.geoms, where)
+        for key, count in {"friction": 1, "pos": 3, "quat": 4, "rgba": 4}.items():
+            check_numbers(getattr(self, key), count, f"{where}.{key}")
+
 
 _WORLD_KWARGS = {"contype": WORLD_BIT, "conaffinity": ROBOT_BIT | WORLD_BIT}
 _SHAPES = {
@@ -141,22 +164,69 @@ _SHAPES = {
 _NUM_SIZES = {"box": 3, "sphere": 1, "capsule": 2, "cylinder": 2}
 
 
-def load_mesh(path: str, scale: Any = 1.0) -> trimesh.Trimesh:
-    """Reads one mesh and scales it.
+def parse_geom(geom: Any, where: str) -> GeomConfig:
+    """A geom, checked; its mesh is read.
+
+    Args:
+        geom: a `GeomConfig` or the same as a mapping.
+        where: what to call it in messages.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it holds no faces or encloses no volume.
+        ValueError: for an unknown key, no shape or several, or a value that cannot be used.
+        FileNotFoundError: if there is no such mesh.
     """
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"object mesh: no file {path}")
-    mesh = trimesh.load(path, force="mesh")
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise ValueError(f"object mesh: {path} holds no faces")
-    mesh.apply_scale(scale)
-    if mesh.convex_hull.volume <= 0:
-        raise ValueError(f"object mesh: {path} encloses no volume")
-    return mesh
+    config = geom if isinstance(geom, GeomConfig) else _from_mapping(GeomConfig, geom, where)
+    shapes = [shape for shape in (*_SHAPES, "mesh") if getattr(config, shape) is not None]
+    if len(shapes) != 1:
+        raise ValueError(f"{where}: give exactly one of {(*_SHAPES, 'mesh')}, got {shapes or 'none'}")
+    for key, count in {"pos": 3, "quat": 4, "body_quat": 4, "rgba": 4}.items():
+        check_numbers(getattr(config, key), count, f"{where}.{key}")
+    if config.mesh is None:
+        check_numbers(getattr(config, shapes[0]), _NUM_SIZES[shapes[0]], f"{where}.{shapes[0]}", positive=True)
+        return config
+    try:
+        load_mesh(config.mesh, config.scale)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{where}.mesh: {error}") from error
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{where}.mesh: {error}") from error
+    return config
+
+
+def _check_geoms(geoms: Any, where: str, needed: bool = True) -> None:
+    if isinstance(geoms, str | Mapping) or not isinstance(geoms, Sequence):
+        raise ValueError(f"{where}.geoms: a list expected, got {geoms!r}")
+    if needed and not geoms:
+        raise ValueError(f"{where}.geoms: at least one expected")
+    for i, geom in enumerate(geoms):
+        parse_geom(geom, f"{where}.geoms[{i}]")
+
+
+def check_numbers(value: Any, count: int, where: str, *, positive: bool = False) -> None:
+    """Raises a ValueError unless `value` is None or so many finite numbers; four are a quaternion, or a colour."""
+    if value is None:
+        return
+    try:
+        numbers = np.atleast_1d(np.asarray(value, float))
+    except (TypeError, ValueError):
+        numbers = np.array([np.nan])
+    if numbers.shape != (count,) or not np.isfinite(numbers).all() or (positive and not (numbers > 0).all()):
+        expected = f"{count} {'positive ' * positive}number{'s' if count > 1 else ''}"
+        raise ValueError(f"{where}: {expected} expected, got {value!r}")
+    if where.endswith("quat") and not numbers.any():
+        raise ValueError(f"{where}: a quaternion of length 1 expected, got {value!r}")
+
+
+def _from_mapping(cls: type, values: Any, where: str) -> Any:
+    names = [f.name for f in fields(cls)]
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{where}: a mapping with {', '.join(names)} expected, got {values!r}")
+    if unknown := sorted(map(str, set(values) - set(names))):
+        raise ValueError(f"{where}: unknown {', '.join(unknown)}; there is {', '.join(names)}")
+    needed = [f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING]
+    if missing := [name for name in needed if name not in values]:
+        raise ValueError(f"{where}: lacks {', '.join(missing)}")
+    return cls(**values)
 
 
 def _rotate(quat: Sequence[float], vec: Sequence[float]) -> np.ndarray:
@@ -185,15 +255,11 @@ def add_geoms(
     """Adds collision geoms that are also the visuals to `body`; `mass` is spread over them by volume.
 
     Raises:
-        ValueError: for a geom that names no shape or several.
+        ValueError, FileNotFoundError: for a geom that cannot be used, see `parse_geom`.
     """
     added = []
     for i, geom in enumerate(geoms):
-        config = geom if isinstance(geom, GeomConfig) else GeomConfig(**geom)
-        where = f"{body.name} geom {i}"
-        shapes = [shape for shape in (*_SHAPES, "mesh") if getattr(config, shape) is not None]
-        if len(shapes) != 1:
-            raise ValueError(f"{where}: give exactly one of {(*_SHAPES, 'mesh')}, got {shapes or 'none'}")
+        config = parse_geom(geom, f"{body.name}: geoms[{i}]")
         kwargs: dict[str, Any] = {
             **_WORLD_KWARGS,
             "name": f"{body.name}_geom{i}",
@@ -213,13 +279,11 @@ def add_geoms(
                 (body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **kwargs), mesh.convex_hull.volume)
             )
             continue
-        values = np.atleast_1d(np.asarray(getattr(config, shapes[0]), float))
-        if values.shape != (_NUM_SIZES[shapes[0]],) or not (np.isfinite(values) & (values > 0)).all():
-            expected = f"{_NUM_SIZES[shapes[0]]} positive sizes"
-            raise ValueError(f"{where}: {shapes[0]}: {expected} expected, got {values.tolist()}")
+        shape = next(shape for shape in _SHAPES if getattr(config, shape) is not None)
+        values = np.atleast_1d(np.asarray(getattr(config, shape), float))
         size = np.zeros(3)
         size[: len(values)] = values
-        added.append((body.add_geom(type=_SHAPES[shapes[0]], size=size, **kwargs), _volume(shapes[0], values)))
+        added.append((body.add_geom(type=_SHAPES[shape], size=size, **kwargs), _volume(shape, values)))
     total = sum(volume for _, volume in added)
     for geom, volume in added:
         geom.mass = mass * volume / total

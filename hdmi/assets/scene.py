@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from hdmi.assets import g1
-from hdmi.assets.objects import ObjectConfig, SceneryConfig, add_object, add_scenery
+from hdmi.assets.objects import ObjectConfig, SceneryConfig, add_object, add_scenery, check_numbers
 from hdmi.assets.robot import ROBOT_BIT, WORLD_BIT, RobotConfig, add_robot
 
 Pose = tuple[Sequence[float], Sequence[float]]
@@ -56,6 +56,13 @@ class Effector:
     body: str
     point: Sequence[float] = (0.0, 0.0, 0.0)
     target: Sequence[float] = (0.0, 0.0, 0.0)
+
+    def check(self, where: str) -> None:
+        """Raises a ValueError that names the field for what cannot be used."""
+        if self.body not in g1.BODY_NAMES:
+            raise ValueError(f"{where}.body: robot has no body {self.body!r}; it has {', '.join(g1.BODY_NAMES)}")
+        check_numbers(self.point, 3, f"{where}.point")
+        check_numbers(self.target, 3, f"{where}.target")
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,8 @@ _HELP = (
     "and leave MUJOCO_GL unset or set it to egl; with a display: MUJOCO_GL=glfw"
 )
 
+_LARGEST = 8192  # pixels, either way: not every OpenGL implementation gives more
+
 
 def _choose_gl() -> None:
     """Falls back to EGL where there is no display and the user has not chosen."""
@@ -28,6 +30,18 @@ def _choose_gl() -> None:
         gl_context.GLContext = GLContext  # where Renderer looks it up
 
 
+def _make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    if not (1 <= height <= _LARGEST and 1 <= width <= _LARGEST):
+        raise RuntimeError(f"pictures of {width} x {height} pixels: expected 1 to {_LARGEST} each way")
+    buffer = model.vis.global_
+    buffer.offwidth, buffer.offheight = max(width, buffer.offwidth), max(height, buffer.offheight)
+    try:
+        _choose_gl()
+        return mujoco.Renderer(model, height, width)
+    except Exception as error:
+        raise RuntimeError(_HELP.format(error=error)) from error
+
+
 def look_at(data: mujoco.MjData) -> np.ndarray:
     """Where a camera looks that follows the robot: steadily at standing height, higher where the robot climbs. [3]"""
     x, y, z = data.body("pelvis").xpos
@@ -38,17 +52,13 @@ class WorldRenderer:
     """Renders worlds of one model with a camera that follows the robot's pelvis.
 
     Raises:
-        RuntimeError: if no rendering back end works; says what to install.
+        RuntimeError: if no rendering back end works; says what to install. For pictures of no size, or too large.
     """
 
     def __init__(
         self, model: mujoco.MjModel, height: int = 480, width: int = 640, distance: float = 2.8, azimuth: float = 130.0
     ):
-        try:
-            _choose_gl()
-            self._renderer = mujoco.Renderer(model, height, width)
-        except Exception as error:
-            raise RuntimeError(_HELP.format(error=error)) from error
+        self._renderer = _make_renderer(model, height, width)
         self._size = (height, width)
         self._camera = mujoco.MjvCamera()
         self._camera.distance, self._camera.azimuth, self._camera.elevation = distance, azimuth, -14.0
@@ -67,7 +77,7 @@ class WorldRenderer:
         """One picture; `draw` may add geoms to the scene. uint8 [height, width, 3]"""
         if (height, width) != self._size:
             self._renderer.close()
-            self._renderer = mujoco.Renderer(model, height, width)
+            self._renderer = _make_renderer(model, height, width)
             self._size = (height, width)
         self._update(model, data)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0

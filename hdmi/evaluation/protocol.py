@@ -23,7 +23,7 @@ from torch import Tensor
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
 from hdmi.build import ConfigError, Task, make_env, make_task
-from hdmi.evaluation.agents import choose_engine, task_config, task_names
+from hdmi.evaluation.agents import choose_engine, task_config, task_files
 from hdmi.learning.checkpoint import POLICY_FILE, CheckpointError
 from hdmi.learning.policy import load_policy
 from hdmi.motion import Reference
@@ -127,7 +127,7 @@ def termination_names(cfg: DictConfig) -> list[str]:
 
 def _terminations_of_task(cfg: DictConfig) -> list[str]:
     """Those of a config's task without ablations; none for a task that conf/task does not have."""
-    return termination_names(task_config(cfg.task.name)) if cfg.task.name in task_names() else []
+    return termination_names(task_config(cfg.task.name)) if cfg.task.name in task_files() else []
 
 
 def make_evaluation_env(cfg: DictConfig, task: Task, num_envs: int) -> TransformedEnv:

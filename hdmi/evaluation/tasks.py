@@ -19,9 +19,10 @@ from rich.table import Table
 from scipy.stats import wilcoxon
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
+from hdmi.assets import ObjectConfig, RobotConfig
 from hdmi.build import ConfigError, Task, make_env, make_task, scene_parts, set_threads
 from hdmi.envs.rendering import WorldRenderer
-from hdmi.evaluation.agents import blind_agent, task_config, task_names
+from hdmi.evaluation.agents import blind_agent, task_config, task_files
 from hdmi.evaluation.protocol import EvalResult, evaluate_policy
 from hdmi.evaluation.video import Moment, Overlay, picture, replay
 from hdmi.learning import Trainer
@@ -49,19 +50,32 @@ def sources(cfg: DictConfig, motion_root: str | None = None) -> dict[str, Path]:
     return found
 
 
-def list_tasks(motion_root: str | None = None) -> Table:
-    """All tasks: object, scenery, effectors, robot, and the motion that `motion_root` selects, as a table."""
+def list_tasks(motion_root: str | None = None, config_dir: str | None = None) -> Table:
+    """All tasks: object, scenery, effectors, robot, and the motion that `motion_root` selects, as a table.
+
+    Tasks whose scene cannot be used are named below it.
+    """
     table = Table(title="Tasks: python train.py task=NAME", title_justify="left")
     for column in ("task", "object", "scenery", "effectors", "robot", "frames", "contact", "sources"):
         table.add_column(column, justify="right" if column == "frames" else "left")
-    for name in task_names():
-        cfg = task_config(name, motion_root)
+    unusable: list[str] = []
+    for name in task_files(config_dir):
+        try:
+            cfg = task_config(name, motion_root, config_dir)
+            parts = scene_parts(cfg)
+        except ConfigError as error:
+            unusable.append(f"{name} cannot be used: {error}")
+            continue
         found = sources(cfg, motion_root)
         path = found.get("shipped" if motion_root is None else "motion_root")
-        frames, contact = _motion_columns(path, [effector.body for effector in cfg.task.effectors])
-        scenery = ", ".join(item.name for item in cfg.task.scenery)
-        effectors = ", ".join(effector.body.removesuffix("_link") for effector in cfg.task.effectors)
-        table.add_row(name, _object(cfg), scenery, effectors, _robot(cfg), frames, contact, ", ".join(found))
+        bodies = [effector.body for effector in parts["effectors"]]
+        frames, contact = _motion_columns(path, bodies)
+        scenery = ", ".join(item.name for item in parts["scenery"])
+        effectors = ", ".join(body.removesuffix("_link") for body in bodies)
+        thing, robot = _object(parts["object"]), _robot(parts["robot"])
+        table.add_row(name, thing, scenery, effectors, robot, frames, contact, ", ".join(found))
+    table.caption = "\n".join(unusable) or None
+    table.caption_justify = "left"
     return table
 
 
@@ -78,19 +92,16 @@ def _motion_columns(path: Path | None, bodies: Sequence[str]) -> tuple[str, str]
     return str(motion.num_frames), ", ".join(dict.fromkeys(columns))
 
 
-def _object(cfg: DictConfig) -> str:
-    node = cfg.task.object
-    if node is None:
+def _object(config: ObjectConfig | None) -> str:
+    if config is None:
         return "-"
-    hinge = node.get("hinge")
-    count = len(node.get("geoms") or ()) + (0 if hinge is None else len(hinge.geoms))
-    kind = "rigid" if hinge is None else "articulated"
-    fixed = ", fixed base" if node.get("fixed_base") else ""
-    return f"{node.name}: {kind}{fixed}, {count} geom{'s' if count > 1 else ''}, {node.get('mass', 1.0):g} kg"
+    count = len(config.geoms) + (0 if config.hinge is None else len(config.hinge.geoms))
+    kind = "rigid" if config.hinge is None else "articulated"
+    fixed = ", fixed base" if config.fixed_base else ""
+    return f"{config.name}: {kind}{fixed}, {count} geom{'s' if count > 1 else ''}, {config.mass:g} kg"
 
 
-def _robot(cfg: DictConfig) -> str:
-    robot = cfg.robot
+def _robot(robot: RobotConfig) -> str:
     parts = [f"{robot.feet} feet, {robot.effector} hands"]
     parts += [f"kp {value:g} {pattern}" for pattern, value in robot.stiffness.items()]
     parts += ["self-collisions"] * bool(robot.self_collisions)
@@ -176,7 +187,12 @@ class TaskCheck:
 
 
 def check_task(
-    name: str, motion_root: str | None = None, frames: int = 65_536, num_envs: int = 128, num_threads: int = 0
+    name: str,
+    motion_root: str | None = None,
+    frames: int = 65_536,
+    num_envs: int = 128,
+    num_threads: int = 0,
+    config_dir: str | None = None,
 ) -> TaskCheck:
     """Smoke test of a task: its environment, its reference, no policy, and a short training.
 
@@ -192,7 +208,7 @@ def check_task(
         ConfigError, MotionError: if the task or its motion does not exist or cannot be used.
     """
     start = time.perf_counter()
-    cfg = task_config(name, motion_root)
+    cfg = task_config(name, motion_root, config_dir)
     cfg.num_envs, cfg.total_frames, cfg.num_threads, cfg.logger.wandb = num_envs, frames, num_threads, None
     if frames < 0:
         raise ConfigError(f"frames: expected 0 or more, got {frames}")

@@ -28,7 +28,7 @@ KEPT = {
     "output_dir": "a continued run stays in its folder",
 }
 # What decides the problem, besides the groups of the stack, and the networks' form.
-_PROBLEM = ("stack", "task", "robot", "sim", "noise", "reference_set", "num_envs")
+_PROBLEM = ("stack", "starts", "task", "robot", "sim", "noise", "reference_set", "num_envs")
 _NETWORKS = ("actor_hidden", "critic_hidden", "activation")
 
 _Path = tuple[str, ...]

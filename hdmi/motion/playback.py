@@ -11,6 +11,7 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from hdmi.assets import Effector, ObjectConfig, RobotConfig, Scene, SceneryConfig, SimConfig, build_scene
+from hdmi.motion.check import MotionError
 from hdmi.motion.kinematics import smoothing_window
 from hdmi.motion.motion import Motion
 from hdmi.motion.reference import Reference, make_reference
@@ -172,7 +173,8 @@ def make_playback(
     A motion without contact labels is taken as one that intends none.
 
     Raises:
-        MotionError, ValueError: if motion and task do not fit together; see `make_reference` and `build_scene`.
+        MotionError: if motion and task do not fit together; see `make_reference`.
+        ValueError: if the scene itself cannot be built; see `build_scene`.
     """
     if motion.object_contact is None and effectors:
         motion = replace(motion, object_contact=np.zeros((motion.num_frames, len(effectors)), bool))
@@ -180,5 +182,10 @@ def make_playback(
     reference = make_reference(
         motion, control_dt=1 / motion.fps, object=object, scenery=scenery, effectors=effectors, robot=robot
     )
+    for item in scenery:
+        if item.name not in reference.placements and item.pos is None:
+            raise MotionError(
+                f"motion {motion.name!r}: body_names lacks {item.name!r}, scenery without a pos in the task"
+            )
     scene = build_scene(robot, SimConfig(), object, scenery, effectors, reference.placements)
     return Playback(motion, reference, scene, reference_qpos(scene, reference))

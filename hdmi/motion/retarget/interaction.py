@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from hdmi.assets import GeomConfig, ObjectConfig
-from hdmi.assets.objects import load_mesh
+from hdmi.assets.mesh import load_mesh
 from hdmi.motion.annotate.surface import object_surfaces
 from hdmi.motion.human import ObjectTrajectory
 from hdmi.motion.ik import Obstacle
@@ -113,7 +113,8 @@ def _extent(geom: GeomConfig, direction: np.ndarray) -> np.ndarray:
     local = (tilt * Rotation.from_quat(geom.quat, scalar_first=True)).inv().apply(direction)
     offset = direction @ tilt.apply(geom.pos)
     if geom.mesh is not None:
-        return offset + (local @ load_mesh(geom.mesh, geom.scale).convex_hull.vertices.T).max(axis=1)
+        corners = load_mesh(geom.mesh, geom.scale).convex_hull.vertices
+        return offset + np.array([(corners @ axis).max() for axis in local])  # not [T, corners] at once
     if geom.box is not None:
         return offset + np.abs(local) @ np.asarray(geom.box, float)
     if geom.sphere is not None:

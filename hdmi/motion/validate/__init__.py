@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Literal
 
 from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig
 from hdmi.motion.motion import Motion, MotionError
@@ -41,6 +42,8 @@ def validate_motion(
     scenery: Sequence[SceneryConfig] = (),
     effectors: Sequence[Effector] = (),
     limits: Mapping[str, Limit] = LIMITS,
+    tolerance: float = 0.0,
+    reduce: Literal["mean", "max"] = "mean",
 ) -> Report:
     """Checks a motion in the scene of its task.
 
@@ -50,12 +53,17 @@ def validate_motion(
     Args:
         robot: which G1; its feet are taken as four points each whatever they are.
         limits: instead of `LIMITS`.
+        tolerance: how far from its contact point an effector may be at no cost in the task's interaction reward, m.
+        reduce: the task's, too; `max`: of several effectors that are to touch, the nearest one counts.
+
+    Raises:
+        ValueError: if the scene itself cannot be built, which says nothing about the motion.
     """
     # one geom per point of a foot tells a foot that rolls over its toes from one that slides
     robot = replace(robot or RobotConfig(), feet="sphere")
     try:
         playback = make_playback(motion, robot=robot, object=object, scenery=scenery, effectors=effectors)
-    except (MotionError, ValueError) as error:
+    except MotionError as error:
         return unreadable(motion.name, error, motion)
     gap = checks.ground_gap(playback)
     dynamics = inverse_dynamics(playback, gap)
@@ -66,7 +74,7 @@ def validate_motion(
         "torque": checks.torque(dynamics),
         **checks.ground(playback, dynamics, gap),
         **checks.objects(playback, dynamics),
-        **checks.labels(playback),
+        **checks.labels(playback, tolerance, reduce),
     }
     described = [item.name for item in scenery] + ([object.name] if object is not None else [])
     notes = checks.missing_parts(playback, described)

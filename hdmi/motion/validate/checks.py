@@ -193,8 +193,13 @@ def _left_alone(playback: Playback) -> np.ndarray:
     return at_rest & ~touched & ~reference.contact.numpy().any(axis=1)
 
 
-def labels(playback: Playback) -> dict[str, Series]:
-    """Contact labels and points against the geometry."""
+def labels(playback: Playback, tolerance: float = 0.0, reduce: str = "mean") -> dict[str, Series]:
+    """Contact labels and points against the geometry.
+
+    Args:
+        tolerance: distance from a contact point that costs nothing, m.
+        reduce: `max`: of the effectors that are to touch in a frame, the nearest one counts.
+    """
     scene, reference = playback.scene, playback.reference
     if not scene.effectors:
         return {}
@@ -204,9 +209,18 @@ def labels(playback: Playback) -> dict[str, Series]:
     surface = np.stack(gaps, axis=1)  # [T, E]
     apart = np.linalg.norm(playback.effector_pos_w - playback.contact_pos_w, axis=-1)
     found, speed = label_contacts(playback, surface)
+
+    def intended(distance: np.ndarray) -> np.ndarray:
+        """Of the effectors that count, NaN of the others. [T, E]"""
+        counts = label
+        if reduce == "max":
+            nearest = np.where(label, distance, np.inf).min(axis=1, keepdims=True)
+            counts = label & (distance == nearest)
+        return np.where(counts, distance.clip(min=0), np.nan)
+
     return {
-        "contact_gap": Series(np.where(label, surface.clip(min=0), np.nan), names),
-        "contact_point": Series(np.where(label, apart, np.nan), names),
+        "contact_gap": Series(intended(surface), names),
+        "contact_point": Series(intended(apart - tolerance), names),
         "unlabelled_contact": Series(np.where(label, np.nan, np.where(found, speed, 0.0)), names),
     }
 

@@ -12,7 +12,7 @@ class Limit:
 
     Args:
         good: up to here nothing is wrong.
-        bad: above it the motion is not worth training on; infinite for what alone never condemns a motion.
+        bad: above it the motion is worse than those this was set by; infinite for what alone never condemns a motion.
         unit: of both.
         about: what is measured, of the worst body, joint or effector in a frame.
         share: of the frames that the check applies to may lie above either bound.
@@ -25,8 +25,8 @@ class Limit:
     share: float = 0.0
 
 
-# `good` is what can be asked of a clean reference; `bad` lies beyond the worst of the public HDMI motions, which
-# policies have been trained on.
+# `good` is what can be asked of a clean reference; `bad` lies beyond the worst of the ten public HDMI motions that
+# docs/motions.md lists. It is no proof: policies have been trained on others that are bad by one check or another.
 LIMITS: dict[str, Limit] = {
     # names and consistency
     "missing_joints": Limit(6, 14, "joints", "joints of the robot that the motion lacks: they hold the default pose"),
@@ -57,6 +57,8 @@ LIMITS: dict[str, Limit] = {
     "object_force": Limit(0.1, math.inf, "weights", "force that the object needs and no contact can give", 0.05),
     # labels
     "contact_gap": Limit(0.03, 0.2, "m", "effector away from the object while its label is on", 0.05),
-    "contact_point": Limit(0.12, 0.4, "m", "effector's point away from its contact point while its label is on", 0.05),
+    "contact_point": Limit(
+        0.12, 0.4, "m", "effector's point away from its contact point (less the tolerance) while its label is on", 0.05
+    ),
     "unlabelled_contact": Limit(0.1, math.inf, "m/s", "object that an effector moves while its label is off", 0.05),
 }
