@@ -30,6 +30,7 @@ from hdmi.assets import (
 )
 from hdmi.envs import HumanoidObjectEnv, MaskedResetEnv, PhysicsBackend, RowResetEnv
 from hdmi.motion import Reference, find_motion, make_reference
+from hdmi.motion.starts import StartTables, start_tables
 
 # What leaves the stack besides the state that steps read back.
 OUTPUTS = (
@@ -56,6 +57,7 @@ class Task:
     name: str
     scene: Scene
     reference: Reference
+    starts: StartTables | None = None
 
 
 def build(node: Any, where: str, **context: Any) -> Any:
@@ -127,7 +129,7 @@ def scene_parts(cfg: DictConfig) -> dict[str, Any]:
         ConfigError: for a node that cannot be used; names it.
     """
     node = task_node(cfg, "task.object")
-    parts = {
+    parts: dict[str, Any] = {
         "robot": _robot(cfg),
         "object": None if node is None else _part(ObjectConfig, node, "task.object"),
         "scenery": _parts_of(SceneryConfig, cfg, "task.scenery"),
@@ -238,7 +240,7 @@ def make_task(cfg: DictConfig) -> Task:
         scene = build_scene(robot, sim, **parts, placements=reference.placements)
     except ValueError as error:
         raise ConfigError(f"task {name!r}: {_one_line(error)}") from error
-    return Task(name, scene, reference)
+    return Task(name, scene, reference, start_tables(scene, reference))
 
 
 def backend_of(cfg: DictConfig) -> Callable[[mujoco.MjModel, int], PhysicsBackend]:
@@ -287,7 +289,7 @@ def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
     """The transforms of a config with the names of their nodes, from the base environment outwards."""
     context = {
         "reference": task.reference,
-        "scene": task.scene,
+        "starts": task.starts,
         "model": task.scene.model,
         "default_pos": tuple(task.scene.default_qpos[task.scene.joint_qpos].tolist()),
         "robot_bodies": task.scene.body_ids.tolist(),

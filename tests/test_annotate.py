@@ -16,6 +16,7 @@ from mocks import load_script
 from scipy.spatial.transform import Rotation
 
 from hdmi.assets import Effector, GeomConfig, HingeConfig, ObjectConfig
+from hdmi.assets.solid import Solid
 from hdmi.build import scene_parts
 from hdmi.evaluation.agents import task_config
 from hdmi.motion import Motion, MotionError, find_motion, load_motion, save_motion
@@ -34,7 +35,6 @@ from hdmi.motion.annotate import (
     object_surfaces,
 )
 from hdmi.motion.annotate.contacts import _label
-from hdmi.motion.annotate.solid import Solid
 
 QUARTER = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # about z
 LEFT, RIGHT = "left_wrist_yaw_link", "right_wrist_yaw_link"

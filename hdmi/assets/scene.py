@@ -51,11 +51,14 @@ class Effector:
         body: of the robot.
         point: on that body, in its frame, m.
         target: on the object's link, in its frame, m; the reference motion's contact points take precedence.
+        press: how far into the object the contact point is moved along the surface's normal, m: what rewards,
+            terminations and observations see. On the surface it asks for a touch, deeper for a grip.
     """
 
     body: str
     point: Sequence[float] = (0.0, 0.0, 0.0)
     target: Sequence[float] = (0.0, 0.0, 0.0)
+    press: float = 0.0
 
     def check(self, where: str) -> None:
         """Raises a ValueError that names the field for what cannot be used."""
@@ -63,6 +66,9 @@ class Effector:
             raise ValueError(f"{where}.body: robot has no body {self.body!r}; it has {', '.join(g1.BODY_NAMES)}")
         check_numbers(self.point, 3, f"{where}.point")
         check_numbers(self.target, 3, f"{where}.target")
+        check_numbers(self.press, 1, f"{where}.press")
+        if self.press < 0:
+            raise ValueError(f"{where}.press: at least 0 m expected, got {self.press}")
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig, g1
+from hdmi.assets.surface import object_surfaces
 from hdmi.motion.check import checked_fps
 from hdmi.motion.kinematics import (
     angular_velocity,
@@ -140,6 +141,7 @@ def make_reference(
             i = motion.joint_names.index(hinge)
             hinge_pos, hinge_vel = motion.joint_pos[:, i : i + 1], motion.joint_vel[:, i : i + 1]
     contact, points = _contacts(motion, effectors)
+    points = _pressed(points, effectors, object)
 
     placed = [item.name for item in scenery] + ([object.name] if object is not None else [])
     placements = {}
@@ -274,6 +276,18 @@ def _contacts(motion: Motion, effectors: Sequence[Effector]) -> tuple[np.ndarray
             )
         points = motion.contact_points
     return contact, points
+
+
+def _pressed(points: np.ndarray, effectors: Sequence[Effector], object: ObjectConfig | None) -> np.ndarray:
+    """Contact points, each moved into the object by its effector's press. [T, E, 3]"""
+    points = np.array(points, float)
+    for e, effector in enumerate(effectors):
+        if effector.press:
+            assert object is not None
+            flat, row = np.unique(points[:, e], axis=0, return_inverse=True)
+            surface = object_surfaces(object)[object.link]
+            points[:, e] = (flat + effector.press * surface.inward(flat))[row.reshape(-1)]
+    return points
 
 
 def resample(motion: Motion, fps: float) -> Motion:

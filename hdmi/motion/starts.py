@@ -36,6 +36,7 @@ class StartTables:
     root_pos: Tensor  # [T, 3] m per unit of size, that keep hands, feet and whatever else touches where they touch
     joint_pos: Tensor  # [T, J] rad per unit of size, likewise
     carries: Tensor  # bool [T, S] scenery on which the object stands, and the robot does not
+    scenery_pos: Tensor  # [S, 3] m, where the scenery is
 
 
 def start_tables(scene: Scene, reference: Reference) -> StartTables:
@@ -61,20 +62,16 @@ def start_tables(scene: Scene, reference: Reference) -> StartTables:
     def tensor(array: np.ndarray) -> Tensor:
         return torch.from_numpy(array if array.dtype == bool else array.astype(np.float32))
 
-    return StartTables(tensor(height), tensor(root), tensor(joints), tensor(carries))
+    places = scene.model.body_pos[scene.scenery_bodies]
+    return StartTables(tensor(height), tensor(root), tensor(joints), tensor(carries), tensor(places))
 
 
 @dataclass(frozen=True)
 class _Touch:
-    first: int
-    second: int
+    bodies: set[int]
     pos: np.ndarray  # [3] m, world
     normal: np.ndarray  # [3]
     distance: float  # m
-
-    @property
-    def bodies(self) -> set[int]:
-        return {self.first, self.second}
 
 
 class _Frame:
@@ -90,14 +87,17 @@ class _Frame:
         if scene.object_free_qpos is not None:
             lowest = min(_lowest(model, data, geom) for geom in scene.object_geoms)
             self.rise = float(data.xpos[self.base, 2] - lowest)
+        bodies = model.geom_bodyid[data.contact.geom]  # [C, 2]
+        apart = np.isin(bodies, scene.body_ids).sum(1) < 2  # the robot's own contacts stay as they are
         self.touching = [
-            _Touch(
-                *(int(model.geom_bodyid[g]) for g in contact.geom),
-                contact.pos.copy(),
-                contact.frame[:3].copy(),
-                contact.dist,
+            _Touch(set(pair), pos, normal, distance)
+            for pair, pos, normal, distance in zip(
+                bodies[apart].tolist(),
+                data.contact.pos[apart],
+                data.contact.frame[apart, :3],
+                data.contact.dist[apart].tolist(),
+                strict=True,
             )
-            for contact in data.contact[: data.ncon]
         ]
 
     def carries(self) -> np.ndarray:

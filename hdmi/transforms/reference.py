@@ -10,10 +10,10 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
-from hdmi.assets import Scene, g1, match_names
+from hdmi.assets import g1, match_names
 from hdmi.functional import local_pose, quat_from_euler, quat_multiply
 from hdmi.motion import Reference
-from hdmi.motion.starts import start_tables
+from hdmi.motion.starts import StartTables
 from hdmi.transforms.common import (
     SpecTransform,
     StateTransform,
@@ -163,7 +163,7 @@ class ReferenceStateInitialization(SpecTransform):
         held_noise: factor of the object's perturbations at frames where contact is intended: an object between two
             hands cannot be somewhere else.
         soft_limit: share of the joint ranges, about their middles, that starts stay in.
-        scene: of the environment; without it the object's size changes nothing, and no support moves.
+        starts: of the reference in its scene; without them the object's size changes nothing, and no support moves.
     """
 
     _NOISES = (
@@ -181,7 +181,7 @@ class ReferenceStateInitialization(SpecTransform):
         first_share: float = 0.0,
         soft_limit: float = 0.95,
         limits: Sequence[Sequence[float]] = g1.JOINT_RANGES,
-        scene: Scene | None = None,
+        starts: StartTables | None = None,
     ):
         super().__init__()
         if start not in ("uniform", "first"):
@@ -200,15 +200,10 @@ class ReferenceStateInitialization(SpecTransform):
         low, high = soft_limits(limits, soft_limit)
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("high", high, persistent=False)
-        tables = None if scene is None or not reference.has_object else start_tables(scene, reference)
-        self.has_tables, self.moves_scenery = tables is not None, False
-        if tables is not None:
-            assert scene is not None
-            for name in ("object_height", "root_pos", "joint_pos", "carries"):
-                self.register_buffer(f"scaled_{name}", getattr(tables, name), persistent=False)
-            places = torch.from_numpy(scene.model.body_pos[scene.scenery_bodies]).float()  # [S, 3]
-            self.register_buffer("scenery_pos", places, persistent=False)
-            self.moves_scenery = bool(tables.carries.any())
+        self.has_starts = starts is not None
+        self.moves_scenery = starts is not None and bool(starts.carries.any())
+        for name, table in ({} if starts is None else vars(starts)).items():
+            self.register_buffer(f"starts_{name}", table, persistent=False)
 
     def sample_frames(self, batch_size: torch.Size, device: torch.device | None) -> Tensor:
         """Start frames. int64 [*batch_size]"""
@@ -248,9 +243,9 @@ class ReferenceStateInitialization(SpecTransform):
 
         def grown(name: str) -> Tensor | float:
             """What the object's size adds."""
-            if scale is None or not self.has_tables:
+            if scale is None or not self.has_starts:
                 return 0.0
-            return (scale - 1) * getattr(self, f"scaled_{name}")[frames]
+            return (scale - 1) * getattr(self, f"starts_{name}")[frames]
 
         root_pos, root_quat = ref.body_pos[frames, 0], ref.body_quat[frames, 0]
         root_lin_vel, root_ang_vel = ref.body_lin_vel[frames, 0], ref.body_ang_vel[frames, 0]
@@ -281,9 +276,9 @@ class ReferenceStateInitialization(SpecTransform):
                 state["object_joint_pos"] = joint + share * noise("object_joint", joint)
                 state["object_joint_vel"] = ref.object_joint_vel[frames]
             if self.moves_scenery:
-                state["scenery_pos"] = self.scenery_pos + self.scaled_carries[frames].unsqueeze(-1) * moved.unsqueeze(
-                    -2
-                )
+                state["scenery_pos"] = self.starts_scenery_pos + self.starts_carries[frames].unsqueeze(
+                    -1
+                ) * moved.unsqueeze(-2)
         return state
 
 
@@ -309,13 +304,13 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
         first_share: float = 0.0,
         soft_limit: float = 0.95,
         limits: Sequence[Sequence[float]] = g1.JOINT_RANGES,
-        scene: Scene | None = None,
+        starts: StartTables | None = None,
         bins: int = 20,
         uniform_share: float = 0.5,
         decay: float = 0.999,
         lead: int = 25,
     ):
-        super().__init__(reference, start, margin, noise, held_noise, first_share, soft_limit, limits, scene)
+        super().__init__(reference, start, margin, noise, held_noise, first_share, soft_limit, limits, starts)
         self.uniform_share, self.decay, self.lead = uniform_share, decay, lead
         self.register_buffer("failures", torch.zeros(bins))
 

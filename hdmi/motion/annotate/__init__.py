@@ -3,6 +3,7 @@
 annotated = annotate_motion(motion, object=box, effectors=hands, overrides=load_overrides("annotation.yaml"))
 """
 
+from hdmi.assets.surface import Surface, object_surfaces
 from hdmi.motion.annotate.annotate import Agreement, agreement, annotate_motion, complete_object
 from hdmi.motion.annotate.contacts import (
     ContactCriteria,
@@ -12,7 +13,6 @@ from hdmi.motion.annotate.contacts import (
     label_contacts,
 )
 from hdmi.motion.annotate.overrides import FILE, Interval, Overrides, load_overrides
-from hdmi.motion.annotate.surface import Surface, object_surfaces
 from hdmi.motion.annotate.trajectory import complete_hinge, complete_trajectory
 
 __all__ = [

@@ -11,7 +11,7 @@ from scipy.ndimage import binary_closing
 from scipy.spatial.transform import Rotation
 
 from hdmi.assets import ObjectConfig
-from hdmi.motion.annotate.surface import Surface, object_surfaces
+from hdmi.assets.surface import Surface, object_surfaces
 from hdmi.motion.check import MotionError
 from hdmi.motion.kinematics import derivative
 from hdmi.motion.playback import Playback

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from hdmi.assets import GeomConfig, ObjectConfig
 from hdmi.assets.mesh import load_mesh
-from hdmi.motion.annotate.surface import object_surfaces
+from hdmi.assets.surface import object_surfaces
 from hdmi.motion.human import ObjectTrajectory
 from hdmi.motion.ik import Obstacle
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdmi.assets import GeomConfig, ObjectConfig
 from hdmi.assets.mesh import load_mesh
-from hdmi.motion.annotate.solid import Solid
+from hdmi.assets.objects import GeomConfig, ObjectConfig
+from hdmi.assets.solid import Solid
 
 _STEP = 1e-5  # m; of the numerical gradient
 
@@ -37,6 +37,13 @@ class Surface:
         """The surface's points nearest to the given ones. [N, 3] -> [N, 3]"""
         distances, nearest = zip(*(shape.nearest(points) for shape in self._shapes), strict=True)
         return np.stack(nearest)[np.argmin(distances, axis=0), np.arange(len(points))]
+
+    def inward(self, points: np.ndarray) -> np.ndarray:
+        """Unit vectors into the object, against the gradient of the distance. [N, 3] -> [N, 3]"""
+        steps = _STEP * np.eye(3)
+        around = self.distance(points[:, None, None] + np.stack([-steps, steps], axis=1))  # [N, 3, 2]
+        falling = around[..., 0] - around[..., 1]
+        return falling / np.maximum(np.linalg.norm(falling, axis=-1, keepdims=True), 1e-12)
 
 
 def object_surfaces(config: ObjectConfig) -> dict[str, Surface]:
