@@ -7,9 +7,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform, TransformedEnv
+
+FRAME_KEY: NestedKey = ("init", "frame")  # what a start keeps when it is drawn again
 
 _ENVS_PER_THREAD = 4096  # with 2048, a second thread saves 0.4 ms of a step and costs physics 8
 
@@ -36,9 +38,10 @@ class RowResetEnv(TransformedEnv):
     then costs twice. Here base environment and transforms are given the n rows, with their numbers
     under `worlds` int64 [n], and results are written into copies of the others' tensors. `reset` itself is unchanged.
 
-    A start in which the object's deepest contact exceeds `max_penetration` is drawn again, up to `redraws` times: from
-    the same frame, each time with less of its noise, at last with none (see `ReferenceStateInitialization`). How many
-    were is counted in `num_redrawn`, and how many stayed too deep all the same in `num_deep`.
+    A start in which the object's deepest contact exceeds `max_penetration` is drawn again, up to `redraws` times: first
+    from the same frame, each time with less of its noise and then with none, then from other frames without noise (see
+    `ReferenceStateInitialization`). How many were is counted in `num_redrawn`, and how many stayed too deep all the
+    same in `num_deep`.
 
     While it steps, torch has one thread per 4096 environments; see `torch_threads`.
 
@@ -76,46 +79,45 @@ class RowResetEnv(TransformedEnv):
         mask = start.get("_reset", None)
         if mask is None:
             mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
-        return self.transform._reset(start, self._redraw_masked(start, fresh, mask.reshape(-1)))
+        self._redraw(start, fresh, mask.reshape(-1))
+        return self.transform._reset(start, fresh)
 
-    def _redraw_masked(self, start: TensorDictBase, fresh: TensorDictBase, mask: Tensor) -> TensorDictBase:
-        """Draws starts of the worlds in the mask again where they are too deep. Batch [N], bool [N]"""
-        worlds = mask.nonzero().squeeze(-1)
-        if self.redraws and len(worlds):
-            fresh[worlds] = self._redraw(start[worlds], fresh[worlds], worlds)
-        return fresh
-
-    def _redraw(self, start: TensorDictBase, fresh: TensorDictBase, worlds: Tensor) -> TensorDictBase:
-        """Draws starts again where they are too deep.
+    def _redraw(self, start: TensorDictBase, fresh: TensorDictBase, mask: Tensor) -> None:
+        """Draws starts again where they are too deep, and writes them into `start` and `fresh`.
 
         Args:
-            start: what the worlds were reset to, with `init`, batch [n].
-            fresh: the base environment's state after that, batch [n].
-            worlds: their numbers, int64 [n].
-
-        Returns:
-            The base environment's state after the last drawing, batch [n].
+            start: what worlds were reset to, with `init`; batch [N].
+            fresh: the base environment's state after that; batch [N].
+            mask: which worlds are meant, bool [N].
         """
+        self._redraw_rows(start, fresh, *[mask.nonzero().squeeze(-1)] * 2)
+
+    def _redraw_rows(self, start: TensorDictBase, fresh: TensorDictBase, worlds: Tensor, at: Tensor) -> None:
+        """As `_redraw`, of the worlds of these numbers, which stand `at` these places in the batch. int64 [n]"""
         for attempt in range(1, self.redraws + 1):
             rows = self._too_deep(worlds).nonzero().squeeze(-1)
             if not len(rows):
-                return fresh
+                return
             self._counts[0] += len(rows)
-            again = self._same_frames(start[rows], attempt).set("worlds", worlds[rows])
-            fresh[rows] = self.base_env.reset_rows(self.transform._reset_env_preprocess(again))
+            again = self._again(start[at[rows]], attempt).set("worlds", worlds[rows])
+            again = self.transform._reset_env_preprocess(again)
+            fresh[at[rows]] = self.base_env.reset_rows(again)
+            if (frame := start.get(FRAME_KEY, None)) is not None:
+                start.set(FRAME_KEY, frame.index_put((at[rows],), again.get(FRAME_KEY)))
         if self.redraws:
             self._counts[1] += self._too_deep(worlds).sum()
-        return fresh
 
     def _too_deep(self, worlds: Tensor | slice = slice(None)) -> Tensor:
         return self.base_env.penetration()[worlds] > self.max_penetration
 
-    def _same_frames(self, start: TensorDictBase, attempt: int) -> TensorDictBase:
-        """A start to draw again: what came before, the frame, and how much of the noise is left."""
+    def _again(self, start: TensorDictBase, attempt: int) -> TensorDictBase:
+        """A start to draw again: what came before it, how much of the noise is left, and in the first half the frame."""
+        half = (self.redraws + 1) // 2
         init = TensorDict({}, batch_size=start.batch_size, device=start.device)
-        init.set("noise_share", torch.full((*start.batch_size, 1), 1 - attempt / self.redraws, device=start.device))
-        frame = start.get(("init", "frame"), None)
-        if frame is not None:
+        share = max(0.0, 1 - attempt / half)
+        init.set("noise_share", torch.full((*start.batch_size, 1), share, device=start.device))
+        frame = start.get(FRAME_KEY, None)
+        if frame is not None and attempt <= half:
             init.set("frame", frame)
         return start.exclude("init").set("init", init)
 
@@ -163,7 +165,8 @@ class RowResetEnv(TransformedEnv):
             part = tensordict[worlds].set("worlds", worlds)
             tensordict = tensordict.exclude("_reset")
             part = self.transform._reset_env_preprocess(part)
-            state = self._redraw(part, self.base_env.reset_rows(part), worlds)
+            state = self.base_env.reset_rows(part)
+            self._redraw_rows(part, state, worlds, torch.arange(len(worlds)))
             # a kernel for n rows would be compiled anew for one
             reset = self._reset_transforms if len(worlds) > 1 else self.transform._reset
             fresh = reset(part, state)
@@ -191,16 +194,17 @@ class MaskedResetEnv(RowResetEnv):
             compiled = torch.compile(getattr(self.transform, name), dynamic=False, **options)
             setattr(self.transform, name, torch.no_grad()(compiled))
 
-    def _redraw_masked(self, start: TensorDictBase, fresh: TensorDictBase, mask: Tensor) -> TensorDictBase:
+    def _redraw(self, start: TensorDictBase, fresh: TensorDictBase, mask: Tensor) -> None:
         for attempt in range(1, self.redraws + 1):
             deep = mask & self._too_deep()
             self._counts[0] += deep.sum()
-            again = self.transform._reset_env_preprocess(self._same_frames(start, attempt))
-            again = self.base_env._reset(again.set("_reset", deep.unsqueeze(-1)))
-            fresh = again.where(deep, fresh)
+            again = self.transform._reset_env_preprocess(self._again(start, attempt))
+            state = self.base_env._reset(again.copy().set("_reset", deep.unsqueeze(-1)))
+            fresh.update(state.where(deep, fresh))
+            if (frame := start.get(FRAME_KEY, None)) is not None:
+                start.set(FRAME_KEY, torch.where(deep.unsqueeze(-1), again.get(FRAME_KEY), frame))
         if self.redraws:
             self._counts[1] += (mask & self._too_deep()).sum()
-        return fresh
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         done = tensordict.get("done")
@@ -208,7 +212,8 @@ class MaskedResetEnv(RowResetEnv):
             return tensordict
         mask = done.reshape(-1)
         part = self.transform._reset_env_preprocess(tensordict.copy())
-        state = self._redraw_masked(part, self.base_env._reset(part.copy().set("_reset", done)), mask)
+        state = self.base_env._reset(part.copy().set("_reset", done))
+        self._redraw(part, state, mask)
         fresh, tensordict = self.transform._reset(part, state), tensordict.copy()
         for key, value in fresh.items(True, True):
             chosen = mask.reshape(-1, *[1] * (value.ndim - 1))

@@ -20,12 +20,12 @@ from hdmi.motion.playback import reference_qpos
 from hdmi.motion.reference import Reference
 
 NEAR = 0.02  # m; what is closer touches
-REACH = 0.1  # m; what is closer to the object gives way to it, the less the farther it is
+REACH = 0.1  # m; what the robot is closer to, it keeps its distance from, the less the farther it is
 _UPRIGHT = 0.7  # of a contact's normal: a support carries from below
 _LARGEST_TURN = 4.0  # rad per unit of size: 0.4 rad for an object that is a tenth larger
 # Of the least squares: feet stay on the ground, contacts slide rather than open, and the robot is lifted as a whole
 # (per m) rather than bent (per rad).
-_GROUND_WEIGHT, _SLIDE_WEIGHT, _JOINT_WEIGHT, _ROOT_WEIGHT = 3.0, 0.05, 0.02, 0.02
+_GROUND_WEIGHT, _SLIDE_WEIGHT, _JOINT_WEIGHT, _ROOT_WEIGHT = 3.0, 0.05, 0.035, 0.03
 
 
 @dataclass(frozen=True)
@@ -130,13 +130,13 @@ class _Frame:
 
         for touch in self.touching:
             own, others = touch.bodies & self.robot, touch.bodies - self.robot
-            on_object = bool(others & self.object)
-            if not own or not others or (touch.distance >= NEAR and not on_object):
+            if not own or not others:
                 continue
             body, other = own.pop(), others.pop()
+            on_object = other in self.object
             move = self.growth(other, touch.pos) if on_object else np.zeros(3)
             across = np.outer(touch.normal, touch.normal)
-            weight = 1 - max(touch.distance, 0.0) / REACH if on_object else _GROUND_WEIGHT
+            weight = (1.0 if on_object else _GROUND_WEIGHT) * (1 - max(touch.distance, 0.0) / REACH)
             ask(body, touch.pos, move, weight * (across + _SLIDE_WEIGHT * (np.eye(3) - across)))
         for effector, active, target in zip(self.scene.effectors, contact, point, strict=True):
             if active:
