@@ -272,7 +272,7 @@ def make_env(
     base = HumanoidObjectEnv(task.scene, num_envs or cfg.num_envs, backend or backend_of(cfg), pixels)
     here = replace(task, reference=task.reference.to(base.device))
     stack = Compose(*(transform for _, transform in make_transforms(cfg, here))).to(base.device)
-    env = (MaskedResetEnv if base.backend.masked else RowResetEnv)(base, stack, **cfg.starts)
+    env = (MaskedResetEnv if base.backend.masked else RowResetEnv)(base, stack, **cfg.get("starts", {}))
     # raw keys are dropped, but for what steps read back and what learners and logs want
     state = set(env.full_state_spec.keys(True, True))
     entries = list(env.full_observation_spec.keys(True, True))

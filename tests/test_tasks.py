@@ -138,7 +138,7 @@ class TestConfigs:
         assert all(algo == algos[0] for algo in algos)
 
     def test_the_command_line_chooses_the_algorithm(self):
-        algo = load_config("task=push_box", "algo=ppo_paper").algo
+        algo = load_config("task=push_box", "algo=ppo_authors").algo
         assert (algo.desired_kl, algo.epochs, algo.init_noise) == (0.01, 3, 1.0)
 
     def test_another_object_for_a_task(self):

@@ -111,7 +111,7 @@ class RowResetEnv(TransformedEnv):
         return self.base_env.penetration()[worlds] > self.max_penetration
 
     def _again(self, start: TensorDictBase, attempt: int) -> TensorDictBase:
-        """A start to draw again: what came before it, how much of the noise is left, and in the first half the frame."""
+        """A start to draw again: what came before, how much of the noise is left, and in the first half the frame."""
         half = (self.redraws + 1) // 2
         init = TensorDict({}, batch_size=start.batch_size, device=start.device)
         share = max(0.0, 1 - attempt / half)

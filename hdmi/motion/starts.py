@@ -25,7 +25,7 @@ _UPRIGHT = 0.7  # of a contact's normal: a support carries from below
 _LARGEST_TURN = 4.0  # rad per unit of size: 0.4 rad for an object that is a tenth larger
 # Of the least squares: feet stay on the ground, contacts slide rather than open, and the robot is lifted as a whole
 # (per m) rather than bent (per rad).
-_GROUND_WEIGHT, _SLIDE_WEIGHT, _JOINT_WEIGHT, _ROOT_WEIGHT = 3.0, 0.05, 0.035, 0.03
+_GROUND_WEIGHT, _SLIDE_WEIGHT, _JOINT_WEIGHT, _ROOT_WEIGHT = 5.0, 0.05, 0.04, 0.03
 
 
 @dataclass(frozen=True)
