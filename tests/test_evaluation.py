@@ -401,7 +401,7 @@ def test_an_exported_policy_acts_like_its_checkpoint(
 
 @pytest.mark.parametrize("folder", sorted((ROOT / "zoo").iterdir()), ids=lambda folder: folder.name)
 def test_the_zoo(folder: Path):
-    """Its policies are of this package's format, small, and successful by their own evaluation."""
+    """Its policies are of this package's format, small, and successful by their own evaluation, or say they are not."""
     actor, cfg, info = load_policy(folder)
     assert cfg.task.name == folder.name
     assert Path(info["file"]).stat().st_size < 2e6
@@ -409,8 +409,9 @@ def test_the_zoo(folder: Path):
     assert actor(env.reset())["action"].isfinite().all()
     figures = EvalResult.load(folder / "eval.json")
     assert figures["frames"] == info["frames"]
-    assert figures["success_rate"]["mean"] >= 0.9
-    assert f"{100 * figures['success_rate']['mean']:.1f} %" in (folder / "README.md").read_text()
+    card = (folder / "README.md").read_text()
+    assert (figures["success_rate"]["mean"] >= 0.9) != ("has to be trained again" in card)
+    assert f"| success_rate | {100 * figures['success_rate']['mean']:.1f} % |" in card
 
 
 def test_export_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -248,7 +248,7 @@ FAULTS = {
     "repeated name 'pelvis'": ("name: box", "name: pelvis"),
     "task.scenery[0].geoms[0]: unknown bocks": ("geoms: [{box: [0.14,", "geoms: [{bocks: [0.14,"),
     "task.effectors[1].body: robot has no body 'right_claw'; it has pelvis, ": ("right_wrist_yaw_link", "right_claw"),
-    "task.effectors[0].target: 3 numbers expected": ("target: [0.0, 0.14, 0.08]", "target: [0.0, 0.14]"),
+    "task.effectors[0].target: 3 numbers expected": ("target: [0.0, 0.14, 0.05]", "target: [0.0, 0.14]"),
     "task.object: missing; the file's first line has to be `# @package _global_`": ("# @package _global_", "# mine"),
 }
 

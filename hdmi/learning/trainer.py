@@ -288,7 +288,12 @@ class Trainer:
                     batch = self.collector.next()
                     collected = time.perf_counter()
                     figures = {**summarize(batch), **self.update(batch)}
-                    row = self.ranks.mean_row(figures | {"overflows": self.env.base_env.backend.overflows()})
+                    figures |= {
+                        "overflows": self.env.base_env.backend.overflows(),
+                        "redrawn_starts": self.env.num_redrawn,
+                        "deep_starts": self.env.num_deep,
+                    }
+                    row = self.ranks.mean_row(figures)
                     end = time.perf_counter()
                     self.elapsed += end - start
                     self.iteration += 1
