@@ -236,6 +236,27 @@ class TestObjects:
         inertia = sorted(2.5 / 3 * np.array([0.13, 0.10, 0.05]))
         np.testing.assert_allclose(sorted(model.body_inertia[scene.object_body]), inertia, rtol=1e-6)
 
+    @pytest.mark.parametrize(("combine", "friction"), [("max", 0.9), ("object", 0.3)])
+    def test_friction_of_a_pair(self, combine, friction, pose):
+        """A hand inside a smooth object, and that object on the floor."""
+        config = ObjectConfig("crate", [GeomConfig(**BOX)], friction=0.3, friction_combine=combine)
+        hand = (0.25, 0.15, 0.29)
+        scene = scene_with(config, RobotConfig(friction=0.9), placements={"crate": (hand, UPRIGHT)})
+        data = pose(scene)
+        hands = [i for i in range(scene.model.ngeom) if scene.model.geom(i).name.endswith("_hand_collision")]
+        data.qpos[scene.object_free_qpos :][:3] = data.geom_xpos[hands[0]]
+        mujoco.mj_forward(scene.model, data)
+        pairs = {tuple(sorted(scene.model.geom(int(g)).name for g in c.geom)): c.friction[0] for c in data.contact}
+        assert pairs["crate_geom0", "left_hand_collision"] == friction
+        data.qpos[scene.object_free_qpos :][:3] = [3.0, 0.0, 0.29]
+        mujoco.mj_forward(scene.model, data)
+        pairs = {tuple(sorted(scene.model.geom(int(g)).name for g in c.geom)): c.friction[0] for c in data.contact}
+        assert pairs["crate_geom0", "floor"] == 0.3
+
+    def test_unknown_friction_combine(self):
+        with pytest.raises(ValueError, match="friction_combine is 'max' or 'object', got 'product'"):
+            ObjectConfig("crate", [BOX], friction_combine="product")
+
     def test_mass_is_spread_by_volume(self):
         geoms = [
             {"box": (0.1, 0.1, 0.1)},  # 8 l

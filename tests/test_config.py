@@ -136,6 +136,9 @@ class TestMistakes:
             ("termination.root_pose.thresholds=[0.5]", r"termination\.root_pose.*threshold"),
             ("randomization.robot_mass.per=step", r"randomization\.robot_mass.*'step'"),
             ("randomization.robot_mass.bodies=[tail]", r"randomization\.robot_mass.*tail"),
+            ("randomization.robot_mass.bodies=[box]", r"randomization\.robot_mass.*box"),
+            ("randomization.robot_mass.among=object", r"randomization\.robot_mass.*among"),
+            ("termination.lost_contact.require=any", r"termination\.lost_contact.*'any'"),
             ("reference_set.joints=[tail_joint]", r"reference\.motion.*tail_joint"),
             ("noise.gravity_history.steps=0", r"noise\.gravity_history.*steps"),
             ("stack=[reset,magic]", r"stack.*'magic'"),
@@ -159,6 +162,11 @@ class TestMistakes:
             ("task.object._target_=hdmi.assets.Nothing", r"task\.object: _target_ .*Nothing"),
             ("+task.object.color=red", r"task\.object: ObjectConfig has no \['color'\]"),
             ("task.effectors.0.body=tail_link", r"tail_link"),
+            ("+task.effectors.0.press=-0.01", r"task\.effectors\[0\]\.press: at least 0 m"),
+            ("+task.effectors.0.press=deep", r"task\.effectors\[0\]\.press"),
+            ("robot.unactuated=limp", r"robot\.unactuated: expected 'reference' or 'default', got 'limp'"),
+            ("+robot.default_pose.tail_joint=0.1", r"robot: robot\.default_pose: 'tail_joint'"),
+            ("+robot.default_pose.left_knee_joint=-1", r"robot\.default_pose: left_knee_joint at -1 rad"),
         ],
     )
     def test_in_the_task(self, override, message):

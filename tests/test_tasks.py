@@ -88,6 +88,19 @@ def test_reference_that_ships_is_worth_training_on(name: str) -> None:
     assert report.verdict == "good", report.reasons
 
 
+def test_the_robots_masses_leave_the_chairs_seat_alone() -> None:
+    """Its link is called as the robot's are."""
+    cfg = load_config("task=open_foldchair_sit")
+    env = make_env(cfg, 64)
+    env.reset()
+    mass = env.base_env.backend.model("body_mass")[:, env.base_env.scene.model.body("seat_link").id]
+    low, high = cfg.task.randomization.object_mass
+    assert (mass >= low).all()
+    assert (mass <= high).all()
+    assert mass.min() < low + 0.3  # the range is used to its ends
+    assert mass.max() > high - 0.3
+
+
 @pytest.fixture(scope="session")
 def motions(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A motion for every task."""
@@ -384,7 +397,8 @@ class TestCheck:
 class TestPublicMotions:
     @pytest.mark.parametrize("name", sorted(PUBLIC_DISTANCES))
     def test_end_effectors_are_where_they_were_measured(self, name, public_motions):
-        contacts = measure_contacts(load_config(f"task={name}", f"motion_root={public_motions}"))
+        own_wrists = ("robot.unactuated=reference", "robot.default_pose={}")
+        contacts = measure_contacts(load_config(f"task={name}", f"motion_root={public_motions}", *own_wrists))
         mean = np.concatenate([contact.distance for contact in contacts]).mean()
         assert mean == pytest.approx(PUBLIC_DISTANCES[name], abs=0.01)
 
