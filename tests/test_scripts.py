@@ -109,7 +109,8 @@ def test_adaptive_starts_count_the_terminations_of_the_whole_stack() -> None:
     env = make_env(cfg)
     env.rollout(3, break_when_any_done=False)
     adaptive = next(t for t in env.transform.transforms if isinstance(t, AdaptiveStateInitialization))
-    assert 5.9 < float(adaptive.failures.sum()) <= 6.0
+    # two worlds; the last step's episodes are counted when they are reset
+    assert 3.9 < float(adaptive.failures.sum()) <= 4.0
 
 
 @pytest.mark.slow

@@ -346,7 +346,7 @@ class TestObject:
         assert finding.faults[0].part == "left_wrist_yaw_link"
 
     @pytest.mark.parametrize(
-        ("tolerance", "value"), [({"tolerance": 0.2}, 0.05), ({"reduce": "max"}, 0.02), ({"tolerance": 0.3}, 0.0)]
+        ("tolerance", "value"), [({"tolerance": 0.2}, 0.05), ({"reduce": "max"}, 0.01), ({"tolerance": 0.3}, 0.0)]
     )
     def test_contact_point_within_the_tolerance_of_the_task(self, lift_box, tolerance, value):
         motion, scene = lift_box

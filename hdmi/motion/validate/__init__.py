@@ -51,7 +51,8 @@ def validate_motion(
     shapes, number of label columns) is bad for that reason alone.
 
     Args:
-        robot: which G1; its feet are taken as four points each whatever they are.
+        robot: which G1; its feet are taken as four points each whatever they are, and joints that it holds where the
+            motion has them.
         limits: instead of `LIMITS`.
         tolerance: how far from its contact point an effector may be at no cost in the task's interaction reward, m.
         reduce: the task's, too; `max`: of several effectors that are to touch, the nearest one counts.
@@ -60,7 +61,7 @@ def validate_motion(
         ValueError: if the scene itself cannot be built, which says nothing about the motion.
     """
     # one geom per point of a foot tells a foot that rolls over its toes from one that slides
-    robot = replace(robot or RobotConfig(), feet="sphere")
+    robot = replace(robot or RobotConfig(), feet="sphere", held=())
     try:
         playback = make_playback(motion, robot=robot, object=object, scenery=scenery, effectors=effectors)
     except MotionError as error:
