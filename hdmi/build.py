@@ -232,7 +232,7 @@ def make_task(cfg: DictConfig) -> Task:
     """
     parts = scene_parts(cfg)
     robot = parts.pop("robot")
-    sim = _dataclass(SimConfig, {k: v for k, v in cfg.sim.items() if k not in ("device", "backend")}, "sim")
+    sim = _dataclass(SimConfig, {k: v for k, v in cfg.sim.items() if k not in ("device", "backend", "redraws")}, "sim")
     name = task_node(cfg, "task.name")
     motion = find_motion(task_node(cfg, "task.motion"), cfg.motion_root)
     reference = make_reference(motion, control_dt=sim.control_dt, robot=robot, **parts)
