@@ -256,11 +256,12 @@ class TestConfig:
     ) -> None:
         def older(values: dict) -> None:
             del values["algo"]["average"], values["eval_interval"], values["sim"]["impratio"]
-            del values["reward"]["feet_slip"], values["overrides"]
+            del values["reward"]["feet_slip"], values["overrides"], values["starts"]
 
         cfg, _, notes = self.open(f"resume={held(older)}")
         assert (cfg.algo.average, cfg.eval_interval, cfg.sim.impratio) == (0.1, 0, 1.0)
         assert "feet_slip" not in cfg.reward
+        assert "starts" not in cfg  # its starts were taken as they came
         assert len(notes) == 4
         run = load_checkpoint(cfg.resume)["config"]
         assert problem_changes(run, OmegaConf.to_container(cfg)) == []

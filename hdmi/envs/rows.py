@@ -7,11 +7,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 
-FRAME_KEY: NestedKey = ("init", "frame")  # what a start keeps when it is drawn again
+from hdmi.motion.starts import FRAME_KEY, NOISE_SHARE_KEY
 
 _ENVS_PER_THREAD = 4096  # with 2048, a second thread saves 0.4 ms of a step and costs physics 8
 
@@ -113,13 +113,12 @@ class RowResetEnv(TransformedEnv):
     def _again(self, start: TensorDictBase, attempt: int) -> TensorDictBase:
         """A start to draw again: what came before, how much of the noise is left, and in the first half the frame."""
         half = (self.redraws + 1) // 2
-        init = TensorDict({}, batch_size=start.batch_size, device=start.device)
-        share = max(0.0, 1 - attempt / half)
-        init.set("noise_share", torch.full((*start.batch_size, 1), share, device=start.device))
-        frame = start.get(FRAME_KEY, None)
+        share, frame = max(0.0, 1 - attempt / half), start.get(FRAME_KEY, None)
+        again = start.exclude("init")
+        again.set(NOISE_SHARE_KEY, torch.full((*start.batch_size, 1), share, device=start.device))
         if frame is not None and attempt <= half:
-            init.set("frame", frame)
-        return start.exclude("init").set("init", init)
+            again.set(FRAME_KEY, frame)
+        return again
 
     def compile_transforms(self, **options: Any) -> None:
         """Compiles what the transforms do in a step and in a reset of rows; the stack must be complete.

@@ -138,8 +138,13 @@ def _transform_groups(*configs: Mapping[str, Any]) -> set[str]:
 
 
 def _filled(config: dict[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """The config with what it lacks, down to the parameters of a group; what is deeper belongs together."""
+    """The config with what it lacks, down to the parameters of a group; what is deeper belongs together.
+
+    A node that would make another experiment of a run that did not have it stays out.
+    """
     for key, default in defaults.items():
+        if key in _PROBLEM and key not in config:
+            continue
         value = config.setdefault(key, default)
         if key in _transform_groups(config) or not (isinstance(value, dict) and isinstance(default, dict)):
             continue

@@ -13,7 +13,7 @@ from torchrl.data import Composite
 from hdmi.assets import g1, match_names
 from hdmi.functional import local_pose, quat_from_euler, quat_multiply
 from hdmi.motion import Reference
-from hdmi.motion.starts import StartTables
+from hdmi.motion.starts import FRAME_KEY, NOISE_SHARE_KEY, StartTables
 from hdmi.transforms.common import (
     SpecTransform,
     StateTransform,
@@ -22,9 +22,6 @@ from hdmi.transforms.common import (
     soft_limits,
     spec_like,
 )
-
-FRAME_KEY: NestedKey = ("init", "frame")
-NOISE_SHARE_KEY: NestedKey = ("init", "noise_share")
 
 
 def _uniform(shape: Sequence[int], half_range: Tensor | float, device: torch.device | None) -> Tensor:
@@ -276,9 +273,8 @@ class ReferenceStateInitialization(SpecTransform):
                 state["object_joint_pos"] = joint + share * noise("object_joint", joint)
                 state["object_joint_vel"] = ref.object_joint_vel[frames]
             if self.moves_scenery:
-                state["scenery_pos"] = self.starts_scenery_pos + self.starts_carries[frames].unsqueeze(
-                    -1
-                ) * moved.unsqueeze(-2)
+                carried = self.starts_carries[frames].unsqueeze(-1)  # [N, S, 1]
+                state["scenery_pos"] = self.starts_scenery_pos + carried * moved.unsqueeze(-2)
         return state
 
 
