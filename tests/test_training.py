@@ -58,8 +58,10 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Trainer, Path]:
 
 class TestRun:
     def test_leaves_config_metrics_and_rotated_checkpoints(self, trained: tuple[Trainer, Path]) -> None:
-        _, folder = trained
+        trainer, folder = trained
         rows = list(csv.DictReader((folder / "metrics.csv").open()))
+        assert float(rows[-1]["redrawn_starts"]) == trainer.env.num_redrawn > 0
+        assert float(rows[-1]["deep_starts"]) == trainer.env.num_deep
         assert [int(row["iteration"]) for row in rows] == [1, 2, 3, 4]
         assert [int(row["frames"]) for row in rows] == [32, 64, 96, 128]
         for key in ("reward", "reward/interaction", "joint_error", "contact_rate", "termination/root_pose", "kl"):
