@@ -58,10 +58,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Trainer, Path]:
 
 class TestRun:
     def test_leaves_config_metrics_and_rotated_checkpoints(self, trained: tuple[Trainer, Path]) -> None:
-        trainer, folder = trained
+        _, folder = trained
         rows = list(csv.DictReader((folder / "metrics.csv").open()))
-        assert float(rows[-1]["redrawn_starts"]) == trainer.env.num_redrawn > 0
-        assert float(rows[-1]["deep_starts"]) == trainer.env.num_deep
         assert [int(row["iteration"]) for row in rows] == [1, 2, 3, 4]
         assert [int(row["frames"]) for row in rows] == [32, 64, 96, 128]
         for key in ("reward", "reward/interaction", "joint_error", "contact_rate", "termination/root_pose", "kl"):
@@ -71,6 +69,13 @@ class TestRun:
             "checkpoint_000002.pt",
             "checkpoint_000004.pt",
         ]
+
+    def test_counts_starts_that_are_drawn_again(self, tmp_path: Path) -> None:
+        trainer = Trainer(config("starts.max_penetration=-1", "total_frames=32"), tmp_path)  # every start is too deep
+        trainer.run()
+        (row,) = csv.DictReader((tmp_path / "metrics.csv").open())
+        assert float(row["redrawn_starts"]) == trainer.env.num_redrawn == 4 * trainer.env.num_deep > 0
+        assert float(row["deep_starts"]) == trainer.env.num_deep
 
     def test_weights_moved(self, trained: tuple[Trainer, Path], fresh: Trainer) -> None:
         trainer, _ = trained
