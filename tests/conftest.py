@@ -11,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+import torch
 from hypothesis import settings
 
 from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene, default_joint_pos, g1
@@ -23,6 +24,12 @@ FPS = 50.0
 NUM_FRAMES = 21
 BODIES = ("pelvis", "torso_link", "left_wrist_yaw_link", "box")
 JOINTS = ("left_knee_joint", "waist_yaw_joint")
+
+
+@pytest.fixture(autouse=True)
+def drawings() -> None:
+    """Whatever a test draws from torch's generator is the same in every run."""
+    torch.manual_seed(0)
 
 
 @pytest.fixture
