@@ -1,50 +1,8 @@
-"""Exports a trained policy: weights and normalization, config, evaluation, video and a card.
-
-    python scripts/export.py checkpoint=RUN out=FOLDER [num_envs=256] [seed=0]
-
-`checkpoint` is a run folder (its newest checkpoint counts) or a checkpoint file. The policy is evaluated and rendered
-from what was written; `scripts/evaluate.py` and `scripts/play.py` take FOLDER as their `checkpoint`.
-"""
-
-from __future__ import annotations
+"""`hdmi export` of a checkout: see hdmi/commands/export.py."""
 
 import sys
-from dataclasses import dataclass
 
-from rich.console import Console
-
-from hdmi.build import ConfigError
-from hdmi.cli import run_script
-from hdmi.evaluation import RenderingError
-from hdmi.evaluation.card import export
-from hdmi.evaluation.options import parse_options
-
-
-@dataclass
-class Options:
-    """See the module."""
-
-    checkpoint: str | None = None
-    out: str | None = None
-    num_envs: int = 256
-    seed: int = 0
-
-
-def write(arguments: list[str], console: Console) -> int:
-    """Exports, and shows the card."""
-    del console
-    options = parse_options(Options, arguments)
-    if options.checkpoint is None or options.out is None:
-        raise ConfigError("give checkpoint=RUN and out=FOLDER")
-    folder = export(options.checkpoint, options.out, options.num_envs, options.seed)
-    print((folder / "README.md").read_text(encoding="utf-8"))
-    return 0
-
-
-def main(arguments: list[str]) -> int:
-    """Runs the script; returns its exit status."""
-    return run_script(write, arguments, __doc__, errors=(RenderingError,))
-
+from hdmi.commands.export import main
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))

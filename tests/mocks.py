@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from pathlib import Path
+from importlib import import_module
 from types import ModuleType
 
 import torch
@@ -17,24 +15,16 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
-from hdmi.build import Task, make_task
+from hdmi.assembly import Task, make_task
+from hdmi.config import CONF
 from hdmi.transforms.common import spec_like
-
-CONF = Path(__file__).parents[1] / "conf"
-_SCRIPTS = Path(__file__).parents[1] / "scripts"
 
 Script = Mapping[NestedKey, Tensor]
 
 
-def load_script(name: str) -> ModuleType:
-    """A script as a module, to call its `main`."""
-    spec = importlib.util.spec_from_file_location(f"script_{name}", _SCRIPTS / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+def command(name: str) -> ModuleType:
+    """The module of a command, to call its `main`."""
+    return import_module(f"hdmi.commands.{name}")
 
 
 class ScriptedEnv(EnvBase):

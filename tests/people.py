@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdmi.motion import SMPL_JOINTS, HumanMotion, ObjectTrajectory, anthropometric_skeleton
-from hdmi.motion.skeleton import UPRIGHT
+from hdmi.workshop.human import SMPL_JOINTS, HumanMotion, ObjectTrajectory
+from hdmi.workshop.skeleton import UPRIGHT, anthropometric_skeleton
 
 HEIGHT, FPS = 1.75, 50.0
 THIGH = 0.245 * HEIGHT

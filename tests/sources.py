@@ -11,9 +11,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from hdmi.assets import default_joint_pos
-from hdmi.motion import SMPL_JOINTS, anthropometric_skeleton, forward_kinematics
-from hdmi.motion.skeleton import UPRIGHT
-from hdmi.motion.sources.robot import table_order
+from hdmi.motion import forward_kinematics
+from hdmi.workshop.human import SMPL_JOINTS
+from hdmi.workshop.skeleton import UPRIGHT, anthropometric_skeleton
+from hdmi.workshop.sources.robot import table_order
 
 T = 9
 

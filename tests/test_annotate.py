@@ -12,15 +12,15 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
-from mocks import load_script
 from scipy.spatial.transform import Rotation
 
+from hdmi.assembly import scene_parts
 from hdmi.assets import Effector, GeomConfig, HingeConfig, ObjectConfig
 from hdmi.assets.solid import Solid
-from hdmi.build import scene_parts
-from hdmi.evaluation.agents import task_config
+from hdmi.commands import annotate
+from hdmi.config import task_config
 from hdmi.motion import Motion, MotionError, find_motion, load_motion, save_motion
-from hdmi.motion.annotate import (
+from hdmi.workshop.annotate import (
     ContactCriteria,
     Interval,
     Overrides,
@@ -34,7 +34,7 @@ from hdmi.motion.annotate import (
     load_overrides,
     object_surfaces,
 )
-from hdmi.motion.annotate.contacts import _label
+from hdmi.workshop.annotate.contacts import _label
 
 QUARTER = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # about z
 LEFT, RIGHT = "left_wrist_yaw_link", "right_wrist_yaw_link"
@@ -481,7 +481,7 @@ def without_body(motion: Motion, name: str) -> Motion:
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    return load_script("annotate")
+    return annotate
 
 
 class TestScript:

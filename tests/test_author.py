@@ -7,12 +7,14 @@ import pytest
 from mocks import load_config
 from scipy.spatial.transform import Rotation
 
+from hdmi.assembly import scene_parts
 from hdmi.assets import Effector, ObjectConfig, SceneryConfig, g1
-from hdmi.build import scene_parts
-from hdmi.motion import find_motion, forward_kinematics, ik, load_motion
-from hdmi.motion.author import PlanError, author_motion, find_plan, load_plan, parse_plan
-from hdmi.motion.author.balance import COM_HEIGHT, GRAVITY, Load, centre_of_pressure, pendulum_com
-from hdmi.motion.author.footsteps import (
+from hdmi.motion import find_motion, forward_kinematics, load_motion
+from hdmi.motion.kinematics import minimum_jerk
+from hdmi.workshop import ik
+from hdmi.workshop.author import PlanError, author_motion, find_plan, load_plan, parse_plan
+from hdmi.workshop.author.balance import COM_HEIGHT, GRAVITY, Load, centre_of_pressure, pendulum_com
+from hdmi.workshop.author.footsteps import (
     ANKLE_HEIGHT,
     SHIFT_TIME,
     SOLE_CENTRE,
@@ -21,9 +23,8 @@ from hdmi.motion.author.footsteps import (
     root_path,
     stances,
 )
-from hdmi.motion.author.footsteps import centre_of_pressure as planned_pressure
-from hdmi.motion.author.paths import PosePath, pose_path, value_path
-from hdmi.motion.kinematics import minimum_jerk
+from hdmi.workshop.author.footsteps import centre_of_pressure as planned_pressure
+from hdmi.workshop.author.paths import PosePath, pose_path, value_path
 
 FILE = Path("plans/try.yaml")
 FPS = 50.0

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from test_training import config
 
-from hdmi.build import ConfigError
+from hdmi.config import ConfigError
 from hdmi.learning import CheckpointError, Trainer, load_checkpoint
 from hdmi.learning.collectors import InlineCollector, ProcessCollector
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from hdmi.assets import RobotConfig, SimConfig, build_scene
-from hdmi.evaluation.comparison import SceneEnv
+from hdmi.commands.comparison import SceneEnv
 
 
 def test_torchrl_env_steps_the_scene() -> None:

@@ -15,7 +15,8 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from hdmi.build import ConfigError, build, describe, make_env, make_task, make_transforms
+from hdmi.assembly import describe, make_env, make_task, make_transforms
+from hdmi.config import ConfigError, build
 from hdmi.motion import MotionError
 
 CONCATENATIONS = ("observation.critic", "observation.policy")

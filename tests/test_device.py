@@ -12,7 +12,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from hdmi.build import make_env
+from hdmi.assembly import make_env
 from hdmi.envs import BatchBackend, MaskedResetEnv
 from hdmi.envs.backend import LiveBackend
 

@@ -13,7 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 
-from hdmi.build import make_env
+from hdmi.assembly import make_env
 from hdmi.envs import BatchBackend, RowResetEnv
 from hdmi.learning.collectors import WorldCollector
 

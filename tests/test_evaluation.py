@@ -11,12 +11,12 @@ import imageio.v2 as imageio
 import mujoco
 import pytest
 import torch
-from mocks import lift_box, load_config
-from mocks import load_script as script
+from mocks import command, lift_box, load_config
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 
-from hdmi.build import ConfigError, make_env
+from hdmi.assembly import make_env
+from hdmi.config import ConfigError
 from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy, protocol, render_checkpoint, video
 from hdmi.evaluation.agents import BlindAgent, blind_agent
 from hdmi.evaluation.protocol import FirstEpisodes, StartAtFrame, evaluation_config, termination_names
@@ -319,7 +319,7 @@ def short(moments: Iterator[video.Moment], count: int = 4) -> Iterator[video.Mom
 @pytest.mark.usefixtures("gl")
 def test_an_agent_is_evaluated_without_a_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "zero.json"
-    assert script("evaluate").main(["agent=zero", "num_envs=4", "num_threads=1", f"out={out}"]) == 0
+    assert command("evaluate").main(["agent=zero", "num_envs=4", "num_threads=1", f"out={out}"]) == 0
     figures = json.loads(out.read_text())
     assert figures["task"] == "lift_box"
     assert 0 <= figures["success_rate"]["mean"] <= 1
@@ -354,7 +354,7 @@ def test_blind_agents():
 def test_agents_play_into_a_video(
     agent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    play = script("play")
+    play = command("play")
     monkeypatch.setattr(play, "every", lambda moments, stride: short(moments))
     out = tmp_path / "videos" / "play.mp4"
     status = play.main([f"agent={agent}", f"out={out}", "width=128", "height=96", "start=150"])
@@ -381,7 +381,7 @@ def test_an_exported_policy_acts_like_its_checkpoint(
 ):
     monkeypatch.setattr(video, "every", lambda moments, stride: short(moments, 3))
     out = tmp_path / "zoo" / "lift_box"
-    assert script("export").main([f"checkpoint={run}", f"out={out}", "num_envs=2"]) == 0
+    assert command("export").main([f"checkpoint={run}", f"out={out}", "num_envs=2"]) == 0
     assert {path.name for path in out.iterdir()} == {"policy.pt", "config.yaml", "eval.json", "video.mp4", "README.md"}
     original, exported = (load_policy(path)[0] for path in (run, out))
     assert original.state_dict().keys() == exported.state_dict().keys()
@@ -415,9 +415,9 @@ def test_the_zoo(folder: Path):
 
 
 def test_export_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert script("export").main([f"checkpoint={tmp_path}"]) == 2
+    assert command("export").main([f"checkpoint={tmp_path}"]) == 2
     assert "give checkpoint=RUN and out=FOLDER" in capsys.readouterr().err
-    assert script("export").main([f"checkpoint={tmp_path}", f"out={tmp_path}"]) == 2
+    assert command("export").main([f"checkpoint={tmp_path}", f"out={tmp_path}"]) == 2
     assert "no checkpoint_*.pt or policy.pt there" in capsys.readouterr().err
 
 
@@ -447,7 +447,7 @@ def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     monkeypatch.setattr(sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    assert script("play").main(["agent=reference", "window=true"]) == 2
+    assert command("play").main(["agent=reference", "window=true"]) == 2
     assert "needs a display" in capsys.readouterr().err
 
 
@@ -471,13 +471,13 @@ def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch, capsys: pytes
         ("play", ["agent=zero", "task=juggle"], "there is no 'juggle'; there is"),
         ("play", ["agent=zero", "start=300"], "expected a frame from 0 to 298"),
         ("play", ["agent=zero", "task=push_box", "motion_root=nowhere"], "not under nowhere"),
-        ("plot_runs", ["nowhere"], "no metrics.csv"),
+        ("plot", ["nowhere"], "no metrics.csv"),
     ],
 )
 def test_mistakes_end_scripts_with_one_line(
     name: str, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ):
-    assert script(name).main(arguments) == 2
+    assert command(name).main(arguments) == 2
     error = capsys.readouterr().err
     assert message in error
     assert len(error.splitlines()) == 1
@@ -492,7 +492,7 @@ def test_runs_are_plotted(tmp_path: Path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "metrics.csv").write_text(header + "0,100,0.5,0.3,\n1,200,1.0,0.2,0.5\n")
     out = tmp_path / "pictures" / "curves.png"
-    assert script("plot_runs").main([str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(out)]) == 0
+    assert command("plot").main([str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(out)]) == 0
     image = imageio.imread(out)
     assert image.shape[1] > 600
     assert image[..., :3].std() > 5
@@ -514,15 +514,15 @@ def test_runs_without_rows_are_left_out_of_the_picture(tmp_path: Path, capsys: p
     (tmp_path / "absent").mkdir()
     names = [*contents, "absent"]
     out = tmp_path / "curves.png"
-    assert script("plot_runs").main([*(str(tmp_path / name) for name in names), "--out", str(out)]) == 0
+    assert command("plot").main([*(str(tmp_path / name) for name in names), "--out", str(out)]) == 0
     assert out.is_file()
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 5
     for name in ("empty", "header", "first_row_cut_off", "other", "absent"):
         assert any(line.startswith("left out: ") and f"/{name}" in line for line in told), name
     out.unlink()
-    assert script("plot_runs").main([*(str(tmp_path / name) for name in names[2:]), "--out", str(out)]) == 2
+    assert command("plot").main([*(str(tmp_path / name) for name in names[2:]), "--out", str(out)]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert not out.exists()
-    table = script("plot_runs").read_metrics(tmp_path / "cut_off")
+    table = command("plot").read_metrics(tmp_path / "cut_off")
     assert table["frames"].tolist() == [100]

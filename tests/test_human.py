@@ -7,15 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hdmi.motion import (
-    SMPL_JOINTS,
-    HumanMotion,
-    MotionError,
-    ObjectTrajectory,
+from hdmi.motion import MotionError
+from hdmi.workshop.human import SMPL_JOINTS, HumanMotion, ObjectTrajectory
+from hdmi.workshop.skeleton import (
+    UPRIGHT,
     anthropometric_skeleton,
+    body_model_skeleton,
+    height_from_legs,
     pose_skeleton,
+    stand_on_ground,
 )
-from hdmi.motion.skeleton import UPRIGHT, body_model_skeleton, height_from_legs, stand_on_ground
 
 T = 7
 IDENTITY = np.tile([1.0, 0.0, 0.0, 0.0], (T, 1))
@@ -164,7 +165,7 @@ class TestSkeleton:
 class TestBodyModel:
     def write(self, path, **changes: np.ndarray):
         """A body model of 44 vertices: joint j is the mean of vertices 2j and 2j+1; beta 0 is size."""
-        from hdmi.motion.human import SMPL_PARENTS
+        from hdmi.workshop.human import SMPL_PARENTS
 
         skeleton = anthropometric_skeleton(1.7)
         rest = np.zeros((22, 3))

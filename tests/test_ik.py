@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hdmi.assets import default_joint_pos, g1
-from hdmi.motion import forward_kinematics, ik
-from hdmi.motion.ik import ComTarget, IkOptions, Obstacle, OrientationTarget, PointTarget, PostureTarget
+from hdmi.motion import forward_kinematics
+from hdmi.workshop import ik
+from hdmi.workshop.ik import ComTarget, IkOptions, Obstacle, OrientationTarget, PointTarget, PostureTarget
 
 pytest.importorskip("mink")
 

@@ -9,8 +9,8 @@ import torch
 
 from hdmi.assets import Effector, HingeConfig, ObjectConfig, SceneryConfig, g1
 from hdmi.motion import MotionError, find_motion, forward_kinematics, load_motion, make_reference, save_motion
+from hdmi.motion.complete import resample
 from hdmi.motion.kinematics import angular_velocity, derivative
-from hdmi.motion.reference import resample
 
 FPS, T = 50.0, 21  # of the synthetic motion in conftest.py
 BOX = ObjectConfig("box", [{"box": (0.2, 0.2, 0.2)}])

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mocks import CONF, load_script
+from mocks import CONF, command
 
-from hdmi.build import ConfigError, scene_parts
-from hdmi.evaluation.agents import task_config
-from hdmi.evaluation.options import parse_motion_options, parse_options, parse_terminations
+from hdmi.assembly import scene_parts
+from hdmi.commands.options import parse_motion_options, parse_options, parse_terminations
+from hdmi.config import ConfigError, task_config
 from hdmi.motion import find_motion
 
 SHIPPED = str(find_motion("lift_box"))
@@ -145,7 +145,7 @@ def test_a_misspelled_option_is_no_motion(arguments: list[str], message: str):
 
 
 def test_a_folder_that_is_not_there_is_named(capsys: pytest.CaptureFixture[str]):
-    assert load_script("validate_motion").main(["runs/lr=0.1/walk"]) == 2
+    assert command("validate").main(["runs/lr=0.1/walk"]) == 2
     assert "runs/lr=0.1/walk: no such folder" in capsys.readouterr().err
 
 
@@ -165,8 +165,8 @@ def scripts(tmp_path: Path) -> dict[str, list[str]]:
     """Scripts that take a task's name, with arguments that need little time."""
     return {
         "annotate": [SHIPPED, f"out={tmp_path / 'annotated'}", "task=my_box"],
-        "validate_motion": [SHIPPED, "task=my_box"],
-        "view_motion": [SHIPPED, "task=my_box", "start=9999"],
+        "validate": [SHIPPED, "task=my_box"],
+        "view": [SHIPPED, "task=my_box", "start=9999"],
         "tasks": ["check", "my_box", "jobs=0"],
         "play": ["agent=reference", "task=my_box", "start=9999"],
         "evaluate": ["agent=zero", "task=my_box", "num_envs=1"],
@@ -182,15 +182,15 @@ def test_config_dir_adds_tasks(folder: str, tmp_path: Path):
     assert cfg.algo == task_config("lift_box").algo  # what it shares with others comes from conf
 
 
-@pytest.mark.parametrize("script", ["annotate", "validate_motion", "view_motion", "play", "author"])
+@pytest.mark.parametrize("script", ["annotate", "validate", "view", "play", "author"])
 def test_scripts_take_tasks_of_a_folder(
     script: str, scripts: dict[str, list[str]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     arguments = [*scripts[script], f"config_dir={own_task(tmp_path / 'own')}"]
-    late = {"view_motion": "start: expected", "play": "start: expected", "author": "nowhere.yaml"}.get(script)
-    assert load_script(script).main(arguments) == (2 if late else 0)
+    late = {"view": "start: expected", "play": "start: expected", "author": "nowhere.yaml"}.get(script)
+    assert command(script).main(arguments) == (2 if late else 0)
     assert (late or "") in capsys.readouterr().err
-    assert load_script(script).main(scripts[script]) == 2
+    assert command(script).main(scripts[script]) == 2
     assert "there is no 'my_box'; there is carry_bread_box, " in capsys.readouterr().err
 
 
@@ -212,7 +212,7 @@ def test_config_dir_that_does_not_do(change, message: str, tmp_path: Path):
 def test_tasks_lists_those_of_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     own_task(tmp_path / "own")
     own_task(tmp_path / "own", LIFT_BOX.replace("sphere", "box").replace("box: [0.12", "bocks: [0.12"), "broken")
-    assert load_script("tasks").main([f"config_dir={tmp_path / 'own'}"]) == 0
+    assert command("tasks").main([f"config_dir={tmp_path / 'own'}"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "my_box" in said
     assert "broken cannot be used: task.object.geoms[0]: unknown bocks" in said
@@ -274,14 +274,14 @@ def test_faults_of_a_scene_name_the_node(fault: str, tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "script", ["annotate", "validate_motion", "view_motion", "tasks", "play", "evaluate", "author", "retarget"]
+    "script", ["annotate", "validate", "view", "tasks", "play", "evaluate", "author", "retarget"]
 )
 def test_every_script_says_what_is_wrong_with_a_scene(
     script: str, scripts: dict[str, list[str]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     message = broken_task("task.object.geoms[0].mesh: {folder}/points.obj: holds no faces", tmp_path)
     arguments = [argument.replace("jobs=0", "jobs=1") for argument in scripts[script]]
-    assert load_script(script).main([*arguments, f"config_dir={tmp_path}"]) == 2
+    assert command(script).main([*arguments, f"config_dir={tmp_path}"]) == 2
     said = capsys.readouterr()
     assert said.err.strip() == f"ConfigError: {message}"
     assert "bad" not in said.out  # it says nothing about the motion

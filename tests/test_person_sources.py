@@ -13,12 +13,12 @@ import torch
 from scipy.spatial.transform import Rotation
 from sources import T, write_amass, write_bvh, write_gvhmr, write_intermimic, write_omomo
 
-from hdmi.motion import SMPL_JOINTS, HumanMotion, MotionError, anthropometric_skeleton, pose_skeleton
-from hdmi.motion.human import SMPL_PARENTS
-from hdmi.motion.skeleton import UPRIGHT
-from hdmi.motion.sources import read_amass, read_bvh, read_gvhmr, read_intermimic, read_omomo, read_person
-from hdmi.motion.sources.joint_names import smpl_names
-from hdmi.motion.sources.world import AXES
+from hdmi.motion import MotionError
+from hdmi.workshop.human import SMPL_JOINTS, SMPL_PARENTS, HumanMotion
+from hdmi.workshop.skeleton import UPRIGHT, anthropometric_skeleton, pose_skeleton
+from hdmi.workshop.sources import read_amass, read_bvh, read_gvhmr, read_intermimic, read_omomo, read_person
+from hdmi.workshop.sources.joint_names import smpl_names
+from hdmi.workshop.sources.world import AXES
 
 # how a world in which SMPL's x, y and z are left, up and forward is written with each axis up
 WRITTEN = {axis: turn.inv() * Rotation.from_euler("x", 90, degrees=True) for axis, turn in AXES.items()}
@@ -143,7 +143,7 @@ class TestUp:
         data = torch.load(path, weights_only=True)
         skeleton = anthropometric_skeleton(1.75)
         pos, _ = skeleton.forward(pose()[None], np.array([[0.0, 0.58 * 1.75, 0.0]]))
-        from hdmi.motion.sources.interaction import _INTERMIMIC_JOINTS
+        from hdmi.workshop.sources.interaction import _INTERMIMIC_JOINTS
 
         every = np.zeros((52, 3))
         for j, name in enumerate(_INTERMIMIC_JOINTS):

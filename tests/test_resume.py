@@ -20,7 +20,7 @@ from mocks import CONF
 from omegaconf import DictConfig, OmegaConf
 from test_training import TINY, config
 
-from hdmi import cli
+from hdmi.commands import train as cli
 from hdmi.evaluation import EvalResult
 from hdmi.learning import CheckpointError, Trainer, load_checkpoint, save_checkpoint
 from hdmi.learning.checkpoint import checkpoints
@@ -49,7 +49,7 @@ def train(*arguments: str) -> None:
     """Without evaluation and video."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli, "finish", lambda *_: None)
-        command(cli.main, *arguments)
+        command(cli.train, *arguments)
 
 
 def interrupted(iterations: int, *arguments: str) -> None:
@@ -282,7 +282,7 @@ class TestConfig:
         folder = held()
         before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
         with pytest.raises(SystemExit) as end:
-            command(cli.main, f"resume={folder}", typed)
+            command(cli.train, f"resume={folder}", typed)
         assert end.value.code == 2
         told = capsys.readouterr().out.strip()
         assert len(told.splitlines()) == 1
@@ -330,7 +330,7 @@ class TestConfig:
     ) -> None:
         folder = held(lambda values: None, "+ablation=no_interaction_reward")
         with pytest.raises(SystemExit) as end:
-            command(cli.main, f"resume={folder}", "reward.interaction.weight=2")
+            command(cli.train, f"resume={folder}", "reward.interaction.weight=2")
         assert end.value.code == 2
         told = capsys.readouterr().out.strip()
         assert len(told.splitlines()) == 1
@@ -395,8 +395,8 @@ class TestWandb:
         monkeypatch.setattr(wandb, "init", noted)
         monkeypatch.setattr("hdmi.evaluation.render_checkpoint", video)
         started = [*SHORT, "logger=offline", "video=true", "seed=3", "+ablation=no_rsi", "total_frames=32"]
-        command(cli.main, *started, f"output_dir={tmp_path}", "run_name=run")
-        command(cli.main, f"resume={tmp_path / 'run'}", "total_frames=64")
+        command(cli.train, *started, f"output_dir={tmp_path}", "run_name=run")
+        command(cli.train, f"resume={tmp_path / 'run'}", "total_frames=64")
         first, second = runs
         assert first == second
         assert first["name"] == "lift_box run"
@@ -427,7 +427,7 @@ class TestWandb:
         monkeypatch.setattr(wandb, "init", fail)
         before = (run / "metrics.csv").read_bytes()
         with pytest.raises(SystemExit) as end:
-            command(cli.main, f"resume={run}", "logger=online")
+            command(cli.train, f"resume={run}", "logger=online")
         assert end.value.code == 2
         told = capsys.readouterr().out.splitlines()[-1]
         assert told.startswith("LoggerError: logger: W&B does not start in mode 'online': No API key configured.;")

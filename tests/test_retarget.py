@@ -10,23 +10,17 @@ from types import ModuleType
 import numpy as np
 import people
 import pytest
-from mocks import load_script
 from scipy.spatial.transform import Rotation
 from sources import write_amass, write_gvhmr
 
 from hdmi.assets import Effector, HingeConfig, ObjectConfig, g1
-from hdmi.motion import HumanMotion, Motion, MotionError, ObjectTrajectory, load_motion, make_reference, save_motion
-from hdmi.motion.retarget import RetargetOptions, RetargetReport, retarget
-from hdmi.motion.retarget.body import find_scaling, read_body, robot_measures
-from hdmi.motion.retarget.feet import find_stances
-from hdmi.motion.retarget.interaction import (
-    handled_point,
-    lowest_point,
-    object_poses,
-    obstacles,
-    on_object,
-    scale_object,
-)
+from hdmi.commands import retarget as retarget_command
+from hdmi.motion import Motion, MotionError, load_motion, make_reference, save_motion
+from hdmi.workshop.human import HumanMotion, ObjectTrajectory
+from hdmi.workshop.retarget import RetargetOptions, RetargetReport, retarget
+from hdmi.workshop.retarget.body import find_scaling, read_body, robot_measures
+from hdmi.workshop.retarget.feet import find_stances
+from hdmi.workshop.retarget.object import handled_point, lowest_point, object_poses, obstacles, on_object, scale_object
 
 pytest.importorskip("mink")
 
@@ -371,7 +365,7 @@ class TestGround:
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    return load_script("retarget")
+    return retarget_command
 
 
 class TestScript:

@@ -24,9 +24,9 @@ from sources import write_mjlab_file
 
 from hdmi.assets import HingeConfig, ObjectConfig, default_joint_pos, g1
 from hdmi.motion import Motion, MotionError, forward_kinematics, load_motion, make_reference, save_motion
-from hdmi.motion.motion import motion_from_poses
-from hdmi.motion.reference import is_finger_joint
-from hdmi.motion.sources import (
+from hdmi.motion.complete import is_finger_joint
+from hdmi.motion.format import motion_from_poses
+from hdmi.workshop.sources import (
     Conventions,
     convert,
     guess_format,
@@ -37,11 +37,9 @@ from hdmi.motion.sources import (
     write_holosoma,
     write_robot_csv,
 )
-from hdmi.motion.sources.formats import Options
-from hdmi.motion.sources.layouts import LAYOUTS
-from hdmi.motion.sources.plain_pickle import read_plain_pickle
-
-sys.path.append(str(Path(__file__).parents[1] / "scripts"))
+from hdmi.workshop.sources.formats import Options
+from hdmi.workshop.sources.layouts import LAYOUTS
+from hdmi.workshop.sources.plain_pickle import read_plain_pickle
 
 T = 12
 FINGERS = [
@@ -139,7 +137,7 @@ class TestOrderOfQuaternions:
 
     @pytest.mark.parametrize("writer", ["mjlab", "holosoma", "hdmi", "pickle"])
     def test_in_every_format(self, tmp_path: Path, writer: str, capsys: pytest.CaptureFixture[str]) -> None:
-        from convert import main
+        from hdmi.commands.convert import main
 
         motion = walking(heading=50)
         other = "wxyz" if writer == "pickle" else "xyzw"
@@ -566,7 +564,7 @@ class TestHands:
     def test_convert_drops_them_with_a_note(
         self, tmp_path: Path, source: str, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        from convert import main
+        from hdmi.commands.convert import main
 
         names = LAYOUTS["g1_29dof_with_hand"]
         rows = table(*pose(), angles(names))
@@ -612,7 +610,7 @@ class TestFewFrames:
     def test_too_few_are_an_error(
         self, tmp_path: Path, to: str, count: int, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        from convert import main
+        from hdmi.commands.convert import main
 
         out = tmp_path / ("out" + {"hdmi": "", "csv": ".csv"}.get(to, ".npz"))
         assert main([f"source={self.folder(tmp_path, count)}", f"to={to}", f"out={out}", "fps=30"]) == 2
@@ -622,7 +620,7 @@ class TestFewFrames:
         assert not out.exists()
 
     def test_two_that_stay_two(self, tmp_path: Path) -> None:
-        from convert import main
+        from hdmi.commands.convert import main
 
         assert main([f"source={self.folder(tmp_path, 2)}", "to=hdmi", f"out={tmp_path / 'out'}", "fps=50"]) == 0
         assert load_motion(tmp_path / "out").num_frames == 2
@@ -632,7 +630,7 @@ class TestFewFrames:
     def test_rates_that_are_none(
         self, tmp_path: Path, fps: str, option: str, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        from convert import main
+        from hdmi.commands.convert import main
 
         path = write_csv(tmp_path / "a.csv", table(*pose(), angles()))
         assert main([f"source={path}", "to=hdmi", f"out={tmp_path / 'out'}", f"{option}={fps}"]) == 2
@@ -753,7 +751,7 @@ class TestPickles:
         np.testing.assert_allclose(motion.body_quat_w[:, 0], pose()[1], atol=1e-6)
 
     def test_clips(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        from convert import main
+        from hdmi.commands.convert import main
 
         path = tmp_path / "set.pkl"
         path.write_bytes(pickle.dumps({"punch": asap(), "kick": asap() | {"fps": 60}, "note": "two"}))

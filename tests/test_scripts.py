@@ -99,7 +99,7 @@ def test_author_writes_a_motion_that_its_task_takes(tmp_path: Path) -> None:
 
 
 def test_adaptive_starts_count_the_terminations_of_the_whole_stack() -> None:
-    from hdmi.build import make_env
+    from hdmi.assembly import make_env
     from hdmi.transforms import AdaptiveStateInitialization
 
     # every step terminates

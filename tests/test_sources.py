@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,9 +21,10 @@ from sources import (
 )
 
 from hdmi.assets import g1
-from hdmi.motion import SMPL_JOINTS, MotionError, anthropometric_skeleton, load_motion, save_motion
-from hdmi.motion.skeleton import UPRIGHT
-from hdmi.motion.sources import (
+from hdmi.motion import MotionError, load_motion, save_motion
+from hdmi.workshop.human import SMPL_JOINTS
+from hdmi.workshop.skeleton import UPRIGHT, anthropometric_skeleton
+from hdmi.workshop.sources import (
     convert,
     guess_format,
     read_amass,
@@ -40,10 +40,8 @@ from hdmi.motion.sources import (
     write_mjlab,
     write_robot_csv,
 )
-from hdmi.motion.sources.interaction import _INTERMIMIC_JOINTS
-from hdmi.motion.sources.robot import table_order
-
-sys.path.append(str(Path(__file__).parents[1] / "scripts"))
+from hdmi.workshop.sources.interaction import _INTERMIMIC_JOINTS
+from hdmi.workshop.sources.robot import table_order
 
 
 class TestGvhmr:
@@ -470,7 +468,7 @@ class TestConvert:
         out = tmp_path / (name + {"hdmi": "", "csv": ".csv"}.get(to, ".npz"))
         _, path, lost = convert(public_motions / name, out, to)
         assert guess_format(path) == ("mjlab" if to == "beyondmimic" else to)
-        from hdmi.motion.sources.formats import Options
+        from hdmi.workshop.sources.formats import Options
 
         second, _, _ = convert(path, tmp_path / "back", "hdmi", options=Options(fps=50.0))
         assert (second.fps, second.num_frames) == (first.fps, first.num_frames)
@@ -534,7 +532,7 @@ class TestConvert:
     def test_the_command_says_what_it_did(
         self, write_motion: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        from convert import main
+        from hdmi.commands.convert import main
 
         source, out = write_motion(), tmp_path / "out.npz"
         assert main([f"source={source}", f"out={out}", "to=mjlab"]) == 0

@@ -18,9 +18,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from sources import robot_arrays, write_amass, write_bvh, write_gmr, write_gvhmr, write_intermimic, write_omomo
 
-import hdmi.motion.sources as readers
+import hdmi.workshop.sources as readers
 from hdmi.assets import g1
-from hdmi.motion import HumanMotion, Motion, MotionError, load_motion, save_motion
+from hdmi.motion import Motion, MotionError, load_motion, save_motion
+from hdmi.workshop.human import HumanMotion
 
 FEW = settings(max_examples=25)
 

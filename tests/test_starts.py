@@ -14,12 +14,12 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from hdmi import transforms as T
+from hdmi.assembly import Task, make_env, make_task
 from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig, SimConfig, build_scene, g1
-from hdmi.build import Task, make_env, make_task
+from hdmi.config import task_files
 from hdmi.envs import HumanoidObjectEnv
-from hdmi.evaluation.agents import task_files
 from hdmi.motion import Motion, make_reference
-from hdmi.motion.motion import motion_from_poses
+from hdmi.motion.format import motion_from_poses
 from hdmi.motion.starts import start_tables
 
 DEPTH = 0.02  # m

@@ -22,21 +22,15 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, check_env_specs, exploration_type
 
+from hdmi.assembly import Task, make_env, make_task, make_transforms, scene_parts
 from hdmi.assets import default_joint_pos, g1
-from hdmi.build import ConfigError, Task, make_env, make_task, make_transforms, scene_parts
-from hdmi.evaluation.agents import BlindAgent, task_files
-from hdmi.evaluation.tasks import (
-    Training,
-    check_task,
-    list_tasks,
-    measure_contacts,
-    picture_frame,
-    render_reference,
-    returns,
-    sources,
-)
+from hdmi.config import ConfigError, task_files
+from hdmi.evaluation.agents import BlindAgent
 from hdmi.motion import Motion, find_motion, forward_kinematics, load_motion, save_motion
-from hdmi.motion.validate import validate_motion
+from hdmi.tasks.catalogue import list_tasks, sources
+from hdmi.tasks.check import Training, check_task, measure_contacts, returns
+from hdmi.tasks.gallery import picture_frame, render_reference
+from hdmi.workshop.validate import validate_motion
 
 ROOT = CONF.parent
 TASKS = list(task_files())
@@ -327,7 +321,7 @@ class TestCheck:
     def test_a_training_that_makes_it_worse_fails(self):
         worse, better = np.arange(20.0), np.arange(1.0, 21.0)
         for training, problems in ((Training(worse, better), 0), (Training(better, worse), 1)):
-            with patch("hdmi.evaluation.tasks._train", return_value=training):
+            with patch("hdmi.tasks.check._train", return_value=training):
                 found = check_task("lift_box", frames=1).problems
             assert len(found) == problems
             assert all("in the median by -1.000" in problem for problem in found)
@@ -336,7 +330,7 @@ class TestCheck:
         # starts and randomization are drawn alike, so that only the policy makes a difference
         cfg = load_config()
         task, agent = make_task(cfg), BlindAgent("zero", cfg.action.history.size)
-        with patch.multiple("hdmi.evaluation.tasks", _RETURN_ENVS=8, _RETURN_STEPS=4):
+        with patch.multiple("hdmi.tasks.check", _RETURN_ENVS=8, _RETURN_STEPS=4):
             first, second = returns(cfg, task, agent), returns(cfg, task, agent)
         assert first.shape == (8,)
         assert np.ptp(first) > 0
@@ -351,7 +345,7 @@ class TestCheck:
                 modes.add(exploration_type())
                 return super().forward(tensordict)
 
-        with patch.multiple("hdmi.evaluation.tasks", _RETURN_ENVS=2, _RETURN_STEPS=2):
+        with patch.multiple("hdmi.tasks.check", _RETURN_ENVS=2, _RETURN_STEPS=2):
             returns(cfg, make_task(cfg), Agent("zero", cfg.action.history.size))
         assert modes == {ExplorationType.RANDOM}
 

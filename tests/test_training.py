@@ -21,7 +21,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives.value import GAE
 
-from hdmi.cli import open_run, run_folder
+from hdmi.commands.train import open_run, run_folder
+from hdmi.evaluation.protocol import training_figures
 from hdmi.learning import CheckpointError, RunningNorm, Trainer, load_checkpoint, load_policy, save_checkpoint
 from hdmi.learning.checkpoint import FORMAT, checkpoints, claim
 from hdmi.learning.networks import bound_noise, make_actor, network_of, normalised_networks
@@ -122,7 +123,7 @@ class TestRun:
         torch.testing.assert_close(mean.mean, actor.mean, rtol=0, atol=0)
 
     def test_that_mean_is_what_is_evaluated(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        trainer = Trainer(config("eval_interval=4"), tmp_path)
+        trainer = Trainer(config("eval_interval=4"), tmp_path, training_figures)
         evaluated: list[torch.nn.Module] = []
 
         def noted(actor: torch.nn.Module, *args: object, **kwargs: object) -> dict[str, float]:

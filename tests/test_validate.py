@@ -10,24 +10,16 @@ from types import ModuleType
 import mujoco
 import numpy as np
 import pytest
-from mocks import load_script
 
+from hdmi.assembly import scene_parts
 from hdmi.assets import Effector, ObjectConfig, default_joint_pos, g1
-from hdmi.build import scene_parts
-from hdmi.evaluation.agents import task_config
-from hdmi.motion import (
-    Motion,
-    find_motion,
-    forward_kinematics,
-    load_motion,
-    make_playback,
-    robot_model,
-    save_motion,
-)
+from hdmi.commands import validate
+from hdmi.config import task_config
+from hdmi.motion import Motion, find_motion, forward_kinematics, load_motion, make_playback, robot_model, save_motion
+from hdmi.motion.format import motion_from_poses
 from hdmi.motion.kinematics import derivative
-from hdmi.motion.motion import motion_from_poses
-from hdmi.motion.validate import LIMITS, Limit, Series, judge, validate_motion
-from hdmi.motion.validate.checks import ground_gap
+from hdmi.workshop.validate import LIMITS, Limit, Series, judge, validate_motion
+from hdmi.workshop.validate.checks import ground_gap
 
 FPS, T = 50.0, 60
 PELVIS = g1.BODY_NAMES.index("pelvis")
@@ -419,7 +411,7 @@ class TestJudge:
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    return load_script("validate_motion")
+    return validate
 
 
 class TestScript:

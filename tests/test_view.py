@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +12,10 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
-from hdmi.build import ConfigError
-from hdmi.evaluation.reference_view import curves, load_view
+from hdmi.config import ConfigError
 from hdmi.motion import find_motion, load_motion, save_motion
-
-sys.path.append(str(Path(__file__).parents[1] / "scripts"))
+from hdmi.workshop.view.curves import curves
+from hdmi.workshop.view.scene import load_view
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +82,7 @@ class TestViewer:
     @pytest.fixture
     def viewer(self, lift_box: Path) -> Iterator:
         pytest.importorskip("viser")
-        from hdmi.evaluation.viewer import ReferenceViewer
+        from hdmi.workshop.view.browser import ReferenceViewer
 
         playback, _ = load_view(lift_box)
         viewer = ReferenceViewer(playback, ghost=playback, port=0)
@@ -132,7 +130,7 @@ def g1_body(viewer, name: str):
 
 class TestCommand:
     def test_writes_a_video(self, lift_box: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        from view_motion import main
+        from hdmi.commands.view import main
 
         out = tmp_path / "a.mp4"
         size = ["width=160", "height=112", "stride=20"]
@@ -150,7 +148,7 @@ class TestCommand:
         assert pictures[0].std() > 10
 
     def test_errors(self, tmp_path: Path, lift_box: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        from view_motion import main
+        from hdmi.commands.view import main
 
         assert main([str(tmp_path)]) == 2
         assert "no such file" in capsys.readouterr().err

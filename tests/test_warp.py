@@ -9,8 +9,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from hdmi.assembly import make_env
 from hdmi.assets import Effector, HingeConfig, ObjectConfig, RobotConfig, Scene, SimConfig, build_scene, g1
-from hdmi.build import make_env
 from hdmi.envs import HumanoidObjectEnv
 from hdmi.envs.backend import STATE_FIELDS
 

@@ -2,6 +2,6 @@
 
 from hdmi.envs.backend import BatchBackend, PhysicsBackend
 from hdmi.envs.humanoid import HumanoidObjectEnv
-from hdmi.envs.rows import MaskedResetEnv, RowResetEnv, torch_threads
+from hdmi.envs.resets import MaskedResetEnv, RowResetEnv
 
-__all__ = ["BatchBackend", "HumanoidObjectEnv", "MaskedResetEnv", "PhysicsBackend", "RowResetEnv", "torch_threads"]
+__all__ = ["BatchBackend", "HumanoidObjectEnv", "MaskedResetEnv", "PhysicsBackend", "RowResetEnv"]

@@ -22,8 +22,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
-from hdmi.build import ConfigError, Task, make_env, make_task
-from hdmi.evaluation.agents import choose_engine, task_config, task_files
+from hdmi.assembly import Task, make_env, make_task
+from hdmi.config import ConfigError, choose_engine, task_config, task_files
 from hdmi.learning.checkpoint import POLICY_FILE, CheckpointError
 from hdmi.learning.policy import load_policy
 from hdmi.motion import Reference
@@ -391,6 +391,12 @@ def evaluate_policy(
             "seed": seed,
         }
     )
+
+
+def training_figures(actor: torch.nn.Module, cfg: DictConfig, task: Task) -> dict[str, float]:
+    """Figures of a policy in the middle of its training, for the log: without what comes after a failure."""
+    result = evaluate_policy(actor, cfg, cfg.eval_envs, task=task, whole_motion=False)
+    return {f"eval/{name}": value["mean"] for name, value in result.figures().items()}
 
 
 def evaluate_checkpoint(

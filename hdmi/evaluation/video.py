@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
-from hdmi.build import Task, make_task
+from hdmi.assembly import Task, make_task
 from hdmi.envs.rendering import WorldRenderer, look_at
 from hdmi.evaluation.protocol import (
     Policy,

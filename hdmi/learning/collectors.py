@@ -20,9 +20,11 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import BaseCollector, Collector, MultiSyncCollector
 from torchrl.modules import ProbabilisticActor
 
-from hdmi.build import ConfigError, Task, make_env
-from hdmi.envs import RowResetEnv, torch_threads
+from hdmi.assembly import Task, make_env
+from hdmi.config import ConfigError
+from hdmi.envs import RowResetEnv
 from hdmi.learning.checkpoint import CheckpointError
+from hdmi.threads import torch_threads
 
 _SEED_STRIDE = 2**12  # between workers; ranks are 2**20 apart
 

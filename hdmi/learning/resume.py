@@ -14,7 +14,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hdmi.build import ConfigError
+from hdmi.config import ConfigError
 from hdmi.learning.checkpoint import POLICY_FILE, CheckpointError, checkpoints, find_checkpoint
 
 CONFIG_FILE = "config.yaml"

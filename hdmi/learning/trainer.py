@@ -26,7 +26,8 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.utils import KLAdaptiveLR
 from torchrl.objectives.value import GAE
 
-from hdmi.build import Task, build, make_task, set_threads
+from hdmi.assembly import Task, make_task
+from hdmi.config import build
 from hdmi.console import make_console
 from hdmi.learning.checkpoint import CheckpointError, claim, load_checkpoint, rotate, save_checkpoint, supersede
 from hdmi.learning.distributed import Ranks
@@ -35,10 +36,14 @@ from hdmi.learning.networks import bound_noise, network_of, normalised_networks
 from hdmi.learning.policy import make_networks
 from hdmi.learning.resume import CONFIG_FILE, problem_changes
 from hdmi.motion import find_motion
+from hdmi.threads import set_threads
 
 _WARMUP_STEPS = 8  # of the untrained policy, for first observation moments
 _MAX_BAD_UPDATES = 20  # minibatches without finite loss or gradient, in a row
 _COLLECTED_KEYS = ("action", "action_log_prob", ("next", "reward"), ("next", "done"), ("next", "terminated"))
+
+
+Evaluate = Callable[[torch.nn.Module, DictConfig, Task], dict[str, float]]
 
 
 class DivergenceError(RuntimeError):
@@ -58,6 +63,8 @@ class Trainer:
     Args:
         cfg: the whole config; `cfg.resume` is a checkpoint to continue from, or null.
         folder: of the run; checkpoints, metrics.csv and config.yaml are written there.
+        evaluate: what gives figures of a policy every `cfg.eval_interval` iterations, from the policy, the config and
+            the task; without it there are none during training.
 
     Attributes:
         actor: that acts in training. averaged: `averaged.module` is the policy that leaves it.
@@ -67,8 +74,8 @@ class Trainer:
         ConfigError, MotionError: for a config that cannot be built.
     """
 
-    def __init__(self, cfg: DictConfig, folder: Path):
-        self.cfg, self.folder = cfg, folder
+    def __init__(self, cfg: DictConfig, folder: Path, evaluate: Evaluate | None = None):
+        self.cfg, self.folder, self.evaluate = cfg, folder, evaluate
         self.ranks = Ranks.from_environment(cfg.device)
         self.device = torch.device(cfg.device)
         if self.device.type == "cuda" and self.device.index is None:
@@ -305,8 +312,9 @@ class Trainer:
                         "learn_sps": frames_per_iteration / (end - collected),
                         "train_sps": frames_per_iteration / (end - start),
                     }
-                    if first and cfg.eval_interval and self.iteration % cfg.eval_interval == 0:
-                        row |= self._evaluate()
+                    if first and self.evaluate and cfg.eval_interval and self.iteration % cfg.eval_interval == 0:
+                        with torch.random.fork_rng():
+                            row |= self.evaluate(self.averaged.module, cfg, self.task)
                     if logger is not None:
                         logger.log(self.iteration, row)
                     progress.update(bar, completed=self.iteration, numbers=_headline(row))
@@ -331,15 +339,6 @@ class Trainer:
         cfg = self.cfg.copy()
         cfg.resume, cfg.resume_anyway = None, False
         return cfg
-
-    def _evaluate(self) -> dict[str, float]:
-        from hdmi.evaluation import evaluate_policy  # evaluation depends on learning, not the other way round
-
-        with torch.random.fork_rng():
-            result = evaluate_policy(
-                self.averaged.module, self.cfg, self.cfg.eval_envs, task=self.task, whole_motion=False
-            )
-        return {f"eval/{k}": v["mean"] for k, v in result.items() if isinstance(v, dict) and "mean" in v}
 
     # -- checkpoints ------------------------------------------------------------------------------------------
 

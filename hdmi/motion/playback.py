@@ -12,8 +12,8 @@ from scipy.signal import savgol_filter
 
 from hdmi.assets import Effector, ObjectConfig, RobotConfig, Scene, SceneryConfig, SimConfig, build_scene
 from hdmi.motion.check import MotionError
+from hdmi.motion.format import Motion
 from hdmi.motion.kinematics import smoothing_window
-from hdmi.motion.motion import Motion
 from hdmi.motion.reference import Reference, make_reference
 
 FAR = 0.5  # m; distances between geoms are not looked for beyond it

@@ -1,0 +1,268 @@
+"""From a config to an environment: every part is a node with a `_target_`, every transform stands in one list."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco
+from omegaconf import DictConfig, OmegaConf
+from rich.table import Table
+from torchrl.envs import CatTensors, Compose, RemoveEmptySpecs, SelectTransform, Transform
+
+from hdmi.assets import (
+    Effector,
+    GeomConfig,
+    ObjectConfig,
+    RobotConfig,
+    Scene,
+    SceneryConfig,
+    SimConfig,
+    build_scene,
+    g1,
+    match_names,
+    parse_geom,
+)
+from hdmi.config import ConfigError, build, build_dataclass, one_line, plain_container, task_node
+from hdmi.envs import HumanoidObjectEnv, MaskedResetEnv, PhysicsBackend, RowResetEnv
+from hdmi.motion import Reference, find_motion, make_reference
+from hdmi.motion.starts import StartTables, start_tables
+
+# What leaves the stack besides the state that steps read back.
+OUTPUTS = (
+    "policy",
+    "critic",
+    "metrics",
+    "termination",
+    "completed",
+    "diverged",
+    "episode_reward",
+    "step_count",
+    "pixels",
+)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a config's task, robot and sim nodes describe."""
+
+    name: str
+    scene: Scene
+    reference: Reference
+    starts: StartTables | None = None
+
+
+def scene_parts(cfg: DictConfig) -> dict[str, Any]:
+    """What a config says of the scene: `robot`, `object`, `scenery` and `effectors`, as keyword arguments.
+
+    Everything in it has been checked, and compiles: what a task's scene has at fault, its meshes included, is found
+    here, before any motion is looked at.
+
+    Raises:
+        ConfigError: for a node that cannot be used; names it.
+    """
+    node = task_node(cfg, "task.object")
+    parts: dict[str, Any] = {
+        "robot": _robot(cfg),
+        "object": None if node is None else _part(ObjectConfig, node, "task.object"),
+        "scenery": _parts_of(SceneryConfig, cfg, "task.scenery"),
+        "effectors": _parts_of(Effector, cfg, "task.effectors"),
+    }
+    bodies = [("task.object", parts["object"])] if parts["object"] is not None else []
+    bodies += [(f"task.scenery[{i}]", item) for i, item in enumerate(parts["scenery"])]
+    try:
+        for where, body in bodies:
+            body.check(where)
+        for i, effector in enumerate(parts["effectors"]):
+            effector.check(f"task.effectors[{i}]")
+        _compile(**parts)
+    except (ValueError, FileNotFoundError) as error:
+        raise ConfigError(one_line(error)) from error
+    return parts
+
+
+def contact_tolerance(cfg: DictConfig) -> dict[str, Any]:
+    """How near effectors have to come by the task's interaction reward: its `tolerance`, m, and `reduce`."""
+    node = cfg.reward.get("interaction")
+    return {key: node[key] for key in ("tolerance", "reduce") if node is not None and key in node}
+
+
+def _part(cls: type, node: Any, where: str) -> Any:
+    part = build(node, where) if OmegaConf.is_dict(node) else None
+    if not isinstance(part, cls):
+        raise ConfigError(f"{where}: a {cls.__name__} expected, got {node}")
+    return part
+
+
+def _parts_of(cls: type, cfg: DictConfig, where: str) -> list[Any]:
+    node = task_node(cfg, where)
+    if node is not None and not OmegaConf.is_list(node):
+        raise ConfigError(f"{where}: a list expected, got {node}")
+    return [_part(cls, item, f"{where}[{i}]") for i, item in enumerate(node or ())]
+
+
+def _compile(robot: RobotConfig, object: ObjectConfig | None, scenery: Any, effectors: Any) -> None:
+    """Compiles a scene without its motion, with boxes for meshes, which take their time.
+
+    Raises:
+        ValueError: for what only shows when parts come together, such as two bodies of one name.
+    """
+
+    def boxes(body: Any) -> Any:
+        geoms = [parse_geom(geom, "") for geom in body.geoms]
+        geoms = [geom if geom.mesh is None else GeomConfig(box=(0.1, 0.1, 0.1)) for geom in geoms]
+        return replace(body, geoms=geoms)
+
+    if object is not None:
+        hinge = None if object.hinge is None else boxes(object.hinge)
+        object = boxes(replace(object, hinge=hinge))
+    origin = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    placements = {item.name: origin for item in scenery}
+    build_scene(robot, SimConfig(), object, [boxes(item) for item in scenery], effectors, placements)
+
+
+def _robot(cfg: DictConfig) -> RobotConfig:
+    values = plain_container(cfg.robot)
+    if (unactuated := values.pop("unactuated", "reference")) == "default":
+        # what no pattern of the scale matches, the policy does not drive
+        scale = "action.joint_position.scale"
+        driven = match_names(list(cfg.action.joint_position.scale), g1.JOINT_NAMES, scale)
+        values["held"] = [name for i, name in enumerate(g1.JOINT_NAMES) if i not in driven]
+    elif unactuated != "reference":
+        raise ConfigError(f"robot.unactuated: expected 'reference' or 'default', got {unactuated!r}")
+    robot: RobotConfig = build_dataclass(RobotConfig, values, "robot")
+    return robot
+
+
+def make_task(cfg: DictConfig) -> Task:
+    """Loads the reference and compiles the scene of a config.
+
+    Raises:
+        ConfigError, MotionError: for a node or a motion that cannot be used.
+    """
+    parts = scene_parts(cfg)
+    robot = parts.pop("robot")
+    sim = build_dataclass(
+        SimConfig, {k: v for k, v in cfg.sim.items() if k not in ("device", "backend", "redraws")}, "sim"
+    )
+    name = task_node(cfg, "task.name")
+    motion = find_motion(task_node(cfg, "task.motion"), cfg.motion_root)
+    reference = make_reference(motion, control_dt=sim.control_dt, robot=robot, **parts)
+    try:
+        scene = build_scene(robot, sim, **parts, placements=reference.placements)
+    except ValueError as error:
+        raise ConfigError(f"task {name!r}: {one_line(error)}") from error
+    return Task(name, scene, reference, start_tables(scene, reference))
+
+
+def backend_of(cfg: DictConfig) -> Callable[[mujoco.MjModel, int], PhysicsBackend]:
+    """What makes the physics backend of a config's sim node from a model and a number of worlds."""
+
+    def make(model: mujoco.MjModel, num_worlds: int) -> PhysicsBackend:
+        given = {"device": cfg.sim.device, "num_threads": cfg.num_threads}
+        backend: PhysicsBackend = build(cfg.sim.backend, "sim.backend", model=model, num_worlds=num_worlds, **given)
+        return backend
+
+    return make
+
+
+def make_env(
+    cfg: DictConfig,
+    num_envs: int | None = None,
+    task: Task | None = None,
+    pixels: tuple[int, int] | None = None,
+    backend: Callable[[mujoco.MjModel, int], PhysicsBackend] | None = None,
+) -> RowResetEnv:
+    """The environment of a config: the base environment under the transforms that `cfg.stack` lists.
+
+    Args:
+        num_envs: instead of the config's.
+        task: made from the config if absent.
+        backend: instead of the config's.
+    """
+    task = make_task(cfg) if task is None else task
+    base = HumanoidObjectEnv(task.scene, num_envs or cfg.num_envs, backend or backend_of(cfg), pixels)
+    here = replace(task, reference=task.reference.to(base.device))
+    stack = Compose(*(transform for _, transform in make_transforms(cfg, here))).to(base.device)
+    env = (MaskedResetEnv if base.backend.masked else RowResetEnv)(base, stack, **cfg.get("starts", {}))
+    # raw keys are dropped, but for what steps read back and what learners and logs want
+    state = set(env.full_state_spec.keys(True, True))
+    entries = list(env.full_observation_spec.keys(True, True))
+    env.append_transform(SelectTransform(*(key for key in entries if key in state or _top(key) in OUTPUTS)))
+    env.append_transform(RemoveEmptySpecs())
+    return env
+
+
+def _top(key: Any) -> str:
+    return key if isinstance(key, str) else key[0]
+
+
+def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
+    """The transforms of a config with the names of their nodes, from the base environment outwards."""
+    context = {
+        "reference": task.reference,
+        "starts": task.starts,
+        "model": task.scene.model,
+        "default_pos": tuple(task.scene.default_qpos[task.scene.joint_qpos].tolist()),
+        "robot_bodies": task.scene.body_ids.tolist(),
+        "effectors": task.scene.effectors,
+        "object_geoms": task.scene.object_geoms,
+        "control_dt": task.scene.sim.control_dt,
+        "decimation": task.scene.sim.decimation,
+    }
+    stack: list[tuple[str, Transform]] = []
+    for group in cfg.stack:
+        if group not in cfg:
+            raise ConfigError(f"stack: the config has no group {group!r}")
+        if group == "observation":
+            stack += _observations(cfg, context)
+            continue
+        for name, node in (cfg[group] or {}).items():
+            if node is not None:
+                where = f"{group}.{name}"
+                stack.append((where, build(node, where, name=name, **context)))
+    return stack
+
+
+def _observations(cfg: DictConfig, context: Mapping[str, Any]) -> list[tuple[str, Transform]]:
+    def terms(group: str) -> list[str]:
+        return [str(name) for name, node in (cfg.observation[group] or {}).items() if node is not None]
+
+    stack: list[tuple[str, Transform]] = []
+    for group in ("policy", "privileged"):
+        for name in terms(group):
+            where = f"observation.{group}.{name}"
+            stack.append((where, build(cfg.observation[group][name], where, out_key=("obs", name), **context)))
+    policy = [("obs", name) for name in terms("policy")]
+    privileged = [("obs", name) for name in terms("privileged")]
+
+    def cat(keys: list[tuple[str, str]], out_key: str) -> CatTensors:
+        return CatTensors(in_keys=keys, out_key=out_key, dim=-1, del_keys=False, sort=False)
+
+    stack.append(("observation.critic", cat(policy + privileged, "critic")))
+    for name, node in (cfg.noise or {}).items():
+        if node is not None:
+            stack.append((f"noise.{name}", build(node, f"noise.{name}", **context)))
+    stack.append(("observation.policy", cat(policy, "policy")))
+    return stack
+
+
+def describe(transforms: list[tuple[str, Transform]]) -> Table:
+    """The transform stack as a table: node, class, keys read and written, weight."""
+    table = Table(title="Transform stack, from the base environment outwards", title_justify="left")
+    for column in ("node", "transform", "reads", "writes", "weight"):
+        table.add_column(column, justify="right" if column == "weight" else "left", overflow="fold")
+
+    def text(keys: Any) -> str:
+        shown = [key if isinstance(key, str) else "/".join(key) for key in keys or []]
+        return ", ".join(shown[:4]) + (f", ... ({len(shown)})" if len(shown) > 4 else "")
+
+    for name, transform in transforms:
+        reads = [*(transform.in_keys or []), *getattr(transform, "state_keys", []), *(transform.in_keys_inv or [])]
+        writes = [*(transform.out_keys or []), *(transform.out_keys_inv or [])]
+        weight = getattr(transform, "weight", None)
+        table.add_row(
+            name, type(transform).__name__, text(reads), text(writes), "" if weight is None else f"{weight:g}"
+        )
+    return table

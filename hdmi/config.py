@@ -1,0 +1,167 @@
+"""Configs: the folder of configs, the tasks in it, and nodes with a `_target_` made into objects."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from hydra.utils import get_class
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+# beside the package in a checkout, in the package when it is installed
+CONF = next(path for path in (Path(__file__).parent / "conf", Path(__file__).parents[1] / "conf") if path.is_dir())
+
+
+class ConfigError(ValueError):
+    """A config that cannot be built; the message names the node."""
+
+
+def build(node: Any, where: str, **context: Any) -> Any:
+    """Instantiates a config node `{_target_: class, parameter: value, ...}`; lists become tuples.
+
+    Args:
+        context: values for parameters of the class that the node does not give.
+
+    Raises:
+        ConfigError: for an unknown class or parameter, or values that the class refuses; names the node.
+    """
+    try:
+        values: dict[str, Any] = plain_container(node) if OmegaConf.is_config(node) else dict(node)
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"{where}: {one_line(error)}") from error
+    path = values.pop("_target_", None)
+    if path is None:
+        raise ConfigError(f"{where}: has no _target_")
+    try:
+        cls = get_class(path)
+    except Exception as error:
+        raise ConfigError(f"{where}: _target_ {path!r}: {error}") from error
+    kwargs = {key: _plain(value, f"{where}.{key}") for key, value in values.items()}
+    parameters = inspect.signature(cls).parameters
+    kwargs |= {key: value for key, value in context.items() if key in parameters and key not in kwargs}
+    if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()) and (unknown := set(kwargs) - set(parameters)):
+        raise ConfigError(f"{where}: {cls.__name__} has no {sorted(unknown)}; it takes {sorted(parameters)}")
+    try:
+        return cls(**kwargs)
+    except ConfigError:  # of a node of its own
+        raise
+    except (TypeError, ValueError, KeyError) as error:
+        raise ConfigError(f"{where} ({cls.__name__}): {error}") from error
+
+
+def _plain(value: Any, where: str) -> Any:
+    if isinstance(value, dict):
+        if "_target_" in value:
+            return build(value, where)
+        return {key: _plain(item, f"{where}.{key}") for key, item in value.items()}
+    if isinstance(value, list):
+        return tuple(_plain(item, f"{where}[{i}]") for i, item in enumerate(value))
+    return value
+
+
+def plain_container(node: Any) -> dict[str, Any]:
+    values: Any = OmegaConf.to_container(node, resolve=True)
+    return values
+
+
+def build_dataclass(cls: type, node: Any, where: str) -> Any:
+    values = plain_container(node) if OmegaConf.is_config(node) else node
+    names = {f.name for f in fields(cls)}
+    if unknown := set(values) - names:
+        raise ConfigError(f"{where}: unknown {sorted(map(str, unknown))}; there is {sorted(names)}")
+    try:
+        return cls(**values)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{where}: {error}") from error
+
+
+def task_node(cfg: DictConfig, where: str) -> Any:
+    """A node of the config that each task has.
+
+    Raises:
+        ConfigError: if this one lacks it.
+    """
+    node = cfg
+    for key in where.split("."):
+        if node is None or key not in node:
+            nested = "task" in cfg and cfg.task is not None and "task" in cfg.task
+            hint = "; the file's first line has to be `# @package _global_`" if nested else ""
+            raise ConfigError(f"{where}: missing{hint}")
+        try:
+            node = node[key]
+        except OmegaConfBaseException as error:
+            raise ConfigError(f"{where}: {one_line(error)}") from error
+    return node
+
+
+def one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def choose_engine(cfg: DictConfig, name: str) -> None:
+    """Changes which engine computes the physics of a config, and nothing else about it.
+
+    Args:
+        name: of a config in conf/sim: `cpu` or `gpu`.
+
+    Raises:
+        ConfigError: if there is no such config.
+    """
+    there = sorted(path.stem for path in (CONF / "sim").glob("*.yaml"))
+    if name not in there:
+        raise ConfigError(f"sim: there is no {name!r}; there is {', '.join(there)}")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        sim = compose("config", overrides=[f"sim={name}"]).sim
+    with open_dict(cfg):
+        cfg.sim.device, cfg.sim.backend = sim.device, sim.backend
+
+
+def task_files(config_dir: str | Path | None = None) -> dict[str, Path]:
+    """The tasks of conf/task, and of `config_dir`/task, by name.
+
+    Raises:
+        ConfigError: if there is no such folder, or both have a task of one name.
+    """
+    found = {path.stem: path for path in (CONF / "task").glob("*.yaml")}
+    if config_dir is not None:
+        if not (folder := Path(config_dir).expanduser()).is_dir():
+            raise ConfigError(f"config_dir: no folder {folder}")
+        own = {path.stem: path for path in (folder / "task").glob("*.yaml")}
+        if twice := sorted(set(own) & set(found)):
+            raise ConfigError(
+                f"config_dir: {own[twice[0]]}: there is a task {twice[0]!r} already; give it another name"
+            )
+        found |= own
+    return dict(sorted(found.items()))
+
+
+def task_config(task: str, motion_root: str | None = None, config_dir: str | Path | None = None) -> DictConfig:
+    """The default config with a task.
+
+    Args:
+        config_dir: folder with `task/NAME.yaml`, and other groups, of tasks that conf lacks, as Hydra's `--config-dir`.
+
+    Raises:
+        ConfigError: if there is no such task, or its file cannot be composed.
+    """
+    if task not in (files := task_files(config_dir)):
+        hint = "; config_dir=FOLDER adds those of FOLDER/task" if config_dir is None else ""
+        raise ConfigError(f"task: there is no {task!r}; there is {', '.join(files)}{hint}")
+    overrides = [f"task={task}"]
+    if config_dir is not None:
+        path = str(Path(config_dir).expanduser().resolve())
+        quoted = path.replace("\\", "\\\\").replace("'", "\\'")
+        overrides.append(f"hydra.searchpath=['file://{quoted}']")
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            cfg = compose("config", overrides=overrides)
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+        raise ConfigError(f"{files[task]}: {' '.join(str(error).split(chr(10) * 2)[0].split())}") from error
+    cfg.motion_root = motion_root
+    return cfg

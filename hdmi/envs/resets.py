@@ -1,0 +1,202 @@
+"""A transformed environment whose steps and resets cost what they must."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase, Transform, TransformedEnv
+
+from hdmi.motion.starts import FRAME_KEY, NOISE_SHARE_KEY
+from hdmi.threads import torch_threads
+
+
+class RowResetEnv(TransformedEnv):
+    """A `TransformedEnv` that resets only rows: the stack sees a batch of the n environments that are done.
+
+    TorchRL computes a reset for all N environments and keeps n of them; where few episodes end at a step, a deep stack
+    then costs twice. Here base environment and transforms are given the n rows, with their numbers
+    under `worlds` int64 [n], and results are written into copies of the others' tensors. `reset` itself is unchanged.
+
+    A start in which the object's deepest contact exceeds `max_penetration` is drawn again, up to `redraws` times: first
+    from the same frame, each time with less of its noise and then with none, then from other frames without noise (see
+    `ReferenceStateInitialization`). How many were is counted in `num_redrawn`, and how many stayed too deep all the
+    same in `num_deep`.
+
+    While it steps, torch has one thread per 4096 environments; see `torch_threads`.
+
+    `compile_transforms` compiles the stack with `torch.compile`.
+
+    The base environment must have `reset_rows` (see `HumanoidObjectEnv`), and transforms must take the batch size
+    from the tensordict.
+
+    Args:
+        env, transform: as for `TransformedEnv`.
+        max_penetration: m. redraws: at most; with 0 every start is taken as it comes.
+    """
+
+    def __init__(self, env: EnvBase, transform: Transform, *, max_penetration: float = 0.02, redraws: int = 0):
+        super().__init__(env, transform)
+        self.max_penetration, self.redraws = max_penetration, redraws
+        self._counts = torch.zeros(2, dtype=torch.int64, device=env.device)
+
+    @property
+    def num_redrawn(self) -> int:
+        """Starts that were drawn again so far. Reading it waits for the device."""
+        return int(self._counts[0])
+
+    @property
+    def num_deep(self) -> int:
+        """Starts so far whose last drawing, too, was too deep. Reading it waits for the device."""
+        return int(self._counts[1])
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        keys = [*self.reset_keys, *self.state_spec.keys(True, True)]
+        tensordict = None if tensordict is None else tensordict.select(*keys, strict=False)
+        start = self.transform._reset_env_preprocess(tensordict)
+        fresh = self.base_env._reset(start, **kwargs)
+        start = fresh.empty() if start is None else start
+        mask = start.get("_reset", None)
+        if mask is None:
+            mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+        self._redraw(start, fresh, mask.reshape(-1))
+        return self.transform._reset(start, fresh)
+
+    def _redraw(self, start: TensorDictBase, fresh: TensorDictBase, mask: Tensor) -> None:
+        """Draws starts again where they are too deep, and writes them into `start` and `fresh`.
+
+        Args:
+            start: what worlds were reset to, with `init`; batch [N].
+            fresh: the base environment's state after that; batch [N].
+            mask: which worlds are meant, bool [N].
+        """
+        self._redraw_rows(start, fresh, *[mask.nonzero().squeeze(-1)] * 2)
+
+    def _redraw_rows(self, start: TensorDictBase, fresh: TensorDictBase, worlds: Tensor, at: Tensor) -> None:
+        """As `_redraw`, of the worlds of these numbers, which stand `at` these places in the batch. int64 [n]"""
+        for attempt in range(1, self.redraws + 1):
+            rows = self._too_deep(worlds).nonzero().squeeze(-1)
+            if not len(rows):
+                return
+            self._counts[0] += len(rows)
+            again = self._again(start[at[rows]], attempt).set("worlds", worlds[rows])
+            again = self.transform._reset_env_preprocess(again)
+            fresh[at[rows]] = self.base_env.reset_rows(again)
+            if (frame := start.get(FRAME_KEY, None)) is not None:
+                start.set(FRAME_KEY, frame.index_put((at[rows],), again.get(FRAME_KEY)))
+        if self.redraws:
+            self._counts[1] += self._too_deep(worlds).sum()
+
+    def _too_deep(self, worlds: Tensor | slice = slice(None)) -> Tensor:
+        return self.base_env.penetration()[worlds] > self.max_penetration
+
+    def _again(self, start: TensorDictBase, attempt: int) -> TensorDictBase:
+        """A start to draw again: what came before, how much of the noise is left, and in the first half the frame."""
+        half = (self.redraws + 1) // 2
+        share, frame = max(0.0, 1 - attempt / half), start.get(FRAME_KEY, None)
+        again = start.exclude("init")
+        again.set(NOISE_SHARE_KEY, torch.full((*start.batch_size, 1), share, device=start.device))
+        if frame is not None and attempt <= half:
+            again.set(FRAME_KEY, frame)
+        return again
+
+    def compile_transforms(self, **options: Any) -> None:
+        """Compiles what the transforms do in a step and in a reset of rows; the stack must be complete.
+
+        The first step and the first reset then take about a minute each. Actions on their way in, a reset of all
+        environments and of a single one stay as they are.
+
+        Args:
+            options: of `torch.compile`.
+        """
+        step = torch.compile(self.transform._step, dynamic=False, **options)
+        reset = torch.compile(self.transform._reset, dynamic=True, **options)
+
+        # under the same gradient mode whoever steps the environment: another one would be compiled again
+        @torch.no_grad()
+        def compiled_step(tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+            return step(tensordict, next_tensordict)
+
+        @torch.no_grad()
+        def compiled_reset(tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+            # Only the number of rows varies. It must not be tied to sizes and offsets that happen to equal it: copies
+            # have no offsets, and the other sizes are declared fixed.
+            tensordict, tensordict_reset = tensordict.clone(), tensordict_reset.clone()
+            for value in (*tensordict.values(True, True), *tensordict_reset.values(True, True)):
+                torch._dynamo.mark_static(value, list(range(1, value.ndim)))
+            return reset(tensordict, tensordict_reset)
+
+        self.transform._step = compiled_step  # type: ignore[method-assign]
+        self._reset_transforms = compiled_reset  # type: ignore[method-assign]
+
+    def _reset_transforms(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self.transform._reset(tensordict, tensordict_reset)
+
+    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        with torch_threads(self.base_env.batch_size.numel()):
+            return super().step(tensordict)
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if not self.any_done(tensordict):
+            return tensordict
+        worlds = tensordict.get("_reset").reshape(-1).nonzero().squeeze(-1)
+        with torch_threads(len(worlds)):  # taking rows out of large tensors would wake the others already
+            part = tensordict[worlds].set("worlds", worlds)
+            tensordict = tensordict.exclude("_reset")
+            part = self.transform._reset_env_preprocess(part)
+            state = self.base_env.reset_rows(part)
+            self._redraw_rows(part, state, worlds, torch.arange(len(worlds)))
+            # a kernel for n rows would be compiled anew for one
+            reset = self._reset_transforms if len(worlds) > 1 else self.transform._reset
+            fresh = reset(part, state)
+            for key, value in fresh.items(True, True):
+                # out of place: the collector keeps references to the last step's tensors
+                tensordict.set(key, tensordict.get(key).index_copy(0, worlds, value))
+        return tensordict
+
+
+class MaskedResetEnv(RowResetEnv):
+    """A `TransformedEnv` whose steps and resets never wait for the device.
+
+    How many environments are done is known on the device only. The stack therefore computes a reset of all of them in
+    every step, in tensors of fixed size, and a mask says whose results count. On a CPU, where asking costs nothing,
+    steps in which nobody is done are left alone.
+    """
+
+    def compile_transforms(self, **options: Any) -> None:
+        """Compiles what the transforms do in a step and in a reset; the stack must be complete.
+
+        Args:
+            options: of `torch.compile`.
+        """
+        for name in ("_step", "_reset"):
+            compiled = torch.compile(getattr(self.transform, name), dynamic=False, **options)
+            setattr(self.transform, name, torch.no_grad()(compiled))
+
+    def _redraw(self, start: TensorDictBase, fresh: TensorDictBase, mask: Tensor) -> None:
+        for attempt in range(1, self.redraws + 1):
+            deep = mask & self._too_deep()
+            self._counts[0] += deep.sum()
+            again = self.transform._reset_env_preprocess(self._again(start, attempt))
+            state = self.base_env._reset(again.copy().set("_reset", deep.unsqueeze(-1)))
+            fresh.update(state.where(deep, fresh))
+            if (frame := start.get(FRAME_KEY, None)) is not None:
+                start.set(FRAME_KEY, torch.where(deep.unsqueeze(-1), again.get(FRAME_KEY), frame))
+        if self.redraws:
+            self._counts[1] += (mask & self._too_deep()).sum()
+
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        done = tensordict.get("done")
+        if done.device.type == "cpu" and not done.any():
+            return tensordict
+        mask = done.reshape(-1)
+        part = self.transform._reset_env_preprocess(tensordict.copy())
+        state = self.base_env._reset(part.copy().set("_reset", done))
+        self._redraw(part, state, mask)
+        fresh, tensordict = self.transform._reset(part, state), tensordict.copy()
+        for key, value in fresh.items(True, True):
+            chosen = mask.reshape(-1, *[1] * (value.ndim - 1))
+            tensordict.set(key, torch.where(chosen, value, tensordict.get(key)))
+        return tensordict

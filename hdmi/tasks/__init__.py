@@ -1,0 +1,1 @@
+"""The tasks of conf/task: catalogue, smoke test, pictures."""

@@ -1,0 +1,226 @@
+"""The tasks of conf/task: what each consists of, a smoke test, and a picture of its reference."""
+
+from __future__ import annotations
+
+import io
+import math
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from rich.table import Table
+from scipy.stats import wilcoxon
+from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
+
+from hdmi.assembly import Task, make_env, make_task, scene_parts
+from hdmi.config import ConfigError, task_config
+from hdmi.evaluation.agents import blind_agent
+from hdmi.evaluation.protocol import EvalResult, evaluate_policy
+from hdmi.learning import Trainer
+from hdmi.motion import find_motion, load_motion, make_playback
+from hdmi.threads import set_threads
+
+_SPEC_ENVS, _EPISODES = 2, 16
+_RETURN_ENVS, _RETURN_STEPS = 384, 96  # episodes before and after a training, and control steps of each
+_CHANCE = 0.01  # p-value below which a training counts as an improvement
+
+
+# -- what there is --------------------------------------------------------------------------------------------
+
+
+# -- does it hold together ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Contact:
+    """How the reference meets the object where its labels say, for one end effector.
+
+    Args:
+        effector: body of the robot.
+        distance: from its point to the contact point, in each labelled frame, m. [F]
+        gap: between its collision shapes and the object's, in each labelled frame, m; negative inside, at most
+            `hdmi.motion.playback.FAR`. [F]
+    """
+
+    effector: str
+    distance: np.ndarray
+    gap: np.ndarray
+
+
+def measure_contacts(cfg: DictConfig) -> list[Contact]:
+    """Replays the reference of a config without physics and measures every labelled contact of its effectors.
+
+    Raises:
+        ConfigError, MotionError: for a node or a motion that cannot be used.
+    """
+    motion = load_motion(find_motion(cfg.task.motion, cfg.motion_root))
+    playback = make_playback(motion, **scene_parts(cfg))
+    effectors, object_geoms = playback.scene.effectors, playback.scene.object_geoms
+    if not effectors:
+        return []
+    label = playback.reference.contact.numpy()
+    distance = np.linalg.norm(playback.effector_pos_w - playback.contact_pos_w, axis=-1)  # [T, E]
+    contacts = []
+    for e, effector in enumerate(effectors):
+        own = playback.robot_geoms[playback.on_bodies([effector.body])]
+        gap = playback.distances(own, object_geoms).min(axis=1)  # [T]
+        contacts.append(Contact(effector.body, distance[label[:, e], e], gap[label[:, e]]))
+    return contacts
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a short training changed: returns of the untrained and of the trained policy, in the same episodes.
+
+    Args:
+        before, after: sum of rewards over the first steps of each episode. [N]
+    """
+
+    before: np.ndarray
+    after: np.ndarray
+
+    @property
+    def gain(self) -> tuple[float, float]:
+        """Mean and median difference of the returns."""
+        difference = self.after - self.before
+        return float(difference.mean()), float(np.median(difference))
+
+    @property
+    def chance(self) -> float:
+        """One-sided p-value of Wilcoxon's signed-rank test that the trained policy is no better.
+
+        Ranks, because returns have long tails: an episode that starts with a shin in a door may return -179.
+        """
+        return float(wilcoxon(self.after - self.before, zero_method="zsplit", alternative="greater").pvalue)
+
+
+@dataclass
+class TaskCheck:
+    """What the smoke test of one task found; `problems` is empty if it passed."""
+
+    name: str
+    contacts: list[Contact] = field(default_factory=list)
+    zero: EvalResult | None = None  # servos that follow the reference
+    training: Training | None = None
+    seconds: float = 0.0
+    problems: list[str] = field(default_factory=list)
+
+
+def check_task(
+    name: str,
+    motion_root: str | None = None,
+    frames: int = 65_536,
+    num_envs: int = 128,
+    num_threads: int = 0,
+    config_dir: str | None = None,
+) -> TaskCheck:
+    """Smoke test of a task: its environment, its reference, no policy, and a short training.
+
+    1. The environment builds and passes TorchRL's spec check.
+    2. The reference, replayed without physics, meets the object where its labels say: end effectors are on average as
+       close to their contact points as the lost-contact termination asks for.
+    3. Servos that follow the reference give finite survival and errors.
+    4. A training of `frames` control steps improves the return that PPO maximizes, that of the policy with its
+       exploration noise: both policies play the first steps of the same episodes (start frames, perturbations and
+       randomization drawn alike), and a signed-rank test finds the trained one better. 0 skips it.
+
+    Raises:
+        ConfigError, MotionError: if the task or its motion does not exist or cannot be used.
+    """
+    start = time.perf_counter()
+    cfg = task_config(name, motion_root, config_dir)
+    cfg.num_envs, cfg.total_frames, cfg.num_threads, cfg.logger.wandb = num_envs, frames, num_threads, None
+    if frames < 0:
+        raise ConfigError(f"frames: expected 0 or more, got {frames}")
+    set_threads(num_threads)
+    task = make_task(cfg)
+    check = TaskCheck(name)
+    try:
+        check_env_specs(make_env(cfg, _SPEC_ENVS, task))
+    except AssertionError as error:
+        check.problems.append(f"specs: {error}")
+    check.contacts = measure_contacts(cfg)
+    lost = (cfg.termination or {}).get("lost_contact")
+    limit = math.inf if lost is None else lost.distance
+    for contact in check.contacts:
+        if not len(contact.distance):
+            check.problems.append(f"{contact.effector}: the motion labels no contact")
+        elif (mean := contact.distance.mean()) > limit:
+            check.problems.append(
+                f"{contact.effector}: on average {mean:.2f} m from its contact point where labels say that it touches, "
+                f"and lost_contact allows {limit:g} m"
+            )
+    check.zero = evaluate_policy(blind_agent("zero", cfg, task), cfg, _EPISODES, task)
+    bad = [key for key, value in check.zero.figures().items() if not math.isfinite(value["mean"])]
+    if bad or not check.zero.figures():
+        check.problems.append(f"no policy: {bad or 'no figures'} not finite")
+    if frames:
+        check.training = _train(cfg, task)
+        chance = check.training.chance
+        if not chance < _CHANCE:
+            mean, middle = check.training.gain
+            check.problems.append(
+                f"training: the return changed by {mean:+.3f}, in the median by {middle:+.3f}; "
+                f"signed-rank test: p = {chance:.2g}, expected less than {_CHANCE:g}"
+            )
+    check.seconds = time.perf_counter() - start
+    return check
+
+
+def _train(cfg: DictConfig, task: Task) -> Training:
+    """What a training changes; it leaves nothing behind."""
+    with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()):
+        trainer = Trainer(cfg, Path(folder))
+        before = returns(cfg, task, trainer.actor)
+        trainer.run()
+        return Training(before, returns(cfg, task, trainer.actor))
+
+
+def returns(cfg: DictConfig, task: Task, actor: torch.nn.Module) -> np.ndarray:
+    """Sum of rewards over the first steps of episodes that begin alike in each call, acting with noise. [N]"""
+    with torch.random.fork_rng(), torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        torch.manual_seed(cfg.seed)
+        env = make_env(cfg, _RETURN_ENVS, task)
+        env.set_seed(cfg.seed)
+        steps = env.rollout(_RETURN_STEPS, actor, break_when_any_done=False)["next"]
+        env.close()
+    done = steps["done"].int()
+    first = done.cumsum(1) - done == 0  # up to the end of the first episode. [N, T, 1]
+    return (steps["reward"] * first).sum((1, 2)).numpy()
+
+
+def check_table(checks: Sequence[TaskCheck]) -> Table:
+    """The figures of several checks, a row for each task."""
+    title = f"Tasks: {sum(not check.problems for check in checks)} of {len(checks)} pass"
+    table = Table(title=title, title_justify="left")
+    columns = ("task", "contact distance m", "surface gap m", "no policy: survives", "joints rad", "bodies m", "object")
+    for column in (*columns, "return", "s", "problems"):
+        table.add_column(column, overflow="fold")
+    for check in checks:
+        distance = " ".join(f"{c.distance.mean():.3f}" if len(c.distance) else "-" for c in check.contacts)
+        gap = " ".join(f"{np.median(c.gap):.3f}" if len(c.gap) else "-" for c in check.contacts)
+        figures = {} if check.zero is None else check.zero.figures()
+
+        def shown(key: str, unit: str = "", figures: dict[str, dict[str, float]] = figures) -> str:
+            return f"{figures[key]['mean']:.3f}{unit}" if key in figures else ""
+
+        object_error = shown("object_joint_error", " rad") or shown("object_pos_error", " m")
+        learned = check.training
+        gain = ""
+        if learned is not None:
+            mean, middle = learned.gain
+            gain = f"{mean:+.2f} of {learned.before.mean():.2f}, median {middle:+.2f}, p {learned.chance:.0e}"
+        table.add_row(
+            check.name, distance, gap, shown("survival"), shown("joint_error"), shown("body_error"), object_error,
+            gain, f"{check.seconds:.0f}", "\n".join(check.problems) or "none",
+        )  # fmt: skip
+    return table
+
+
+# -- what it looks like ---------------------------------------------------------------------------------------
