@@ -38,6 +38,7 @@ OUTPUTS = (
     "completed",
     "diverged",
     "episode_reward",
+    "reward_terms",
     "step_count",
     "pixels",
 )
@@ -201,6 +202,12 @@ def _top(key: Any) -> str:
 def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
     """The transforms of a config with the names of their nodes, from the base environment outwards."""
     context = {
+        "joint_names": g1.JOINT_NAMES,
+        "body_names": g1.BODY_NAMES,
+        "joint_ranges": g1.JOINT_RANGES,
+        "effort_limits": g1.EFFORT_LIMITS,
+        "feet": g1.FEET,
+        "robot_mass": g1.TOTAL_MASS,
         "reference": task.reference,
         "starts": task.starts,
         "model": task.scene.model,

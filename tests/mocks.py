@@ -37,6 +37,9 @@ class ScriptedEnv(EnvBase):
         action_size: width of the action.
         episode_steps: steps after which an episode terminates; None for never.
         truncates: whether there is a `truncated` entry.
+        done_group: under which the three are; at the top if None.
+
+    What the latest reset was given is kept in `asked`.
     """
 
     batch_locked = True
@@ -49,6 +52,7 @@ class ScriptedEnv(EnvBase):
         truncates: bool = True,
         action_key: NestedKey = "action",
         reward_key: NestedKey = "reward",
+        done_group: str | None = None,
     ):
         self.script = {unravel_key(key): table for key, table in script.items()}
         self.length, n = next(iter(self.script.values())).shape[:2]
@@ -62,7 +66,9 @@ class ScriptedEnv(EnvBase):
         self.observation_spec = specs
         self.full_action_spec = Composite({action_key: Unbounded(shape=(n, action_size))}, shape=(n,))
         self.full_reward_spec = Composite({reward_key: Unbounded(shape=(n, 1))}, shape=(n,))
-        self.done_names = ("done", "terminated", "truncated") if truncates else ("done", "terminated")
+        names = ("done", "terminated", "truncated") if truncates else ("done", "terminated")
+        self.done_names = [name if done_group is None else (done_group, name) for name in names]
+        self.asked: TensorDictBase | None = None
         self.full_done_spec = Composite(
             {key: Binary(n=1, shape=(n, 1), dtype=torch.bool) for key in self.done_names}, shape=(n,)
         )
@@ -83,11 +89,12 @@ class ScriptedEnv(EnvBase):
         out.set(self.reward_name, torch.zeros(*self.batch_size, 1))
         if self.episode_steps is not None:
             ended = (self.counter >= self.episode_steps).unsqueeze(-1)
-            out.set("terminated", ended)
-            out.set("done", ended.clone())
+            out.set(self.done_names[1], ended)
+            out.set(self.done_names[0], ended.clone())
         return out
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
+        self.asked = tensordict
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.reshape(self.batch_size)
         self.counter = torch.where(mask, 0, self.counter)
@@ -127,6 +134,8 @@ SHAPES: dict[NestedKey, tuple[int, ...]] = {
     ("feet", "swing_time"): (2,),
     ("feet", "touchdown"): (2,),
     ("error", "many"): (4,),
+    ("tracked", "body_pos"): (2, 3),
+    ("ref", "body_pos"): (2, 3),
     ("error", "one"): (1,),
     ("obs", "x"): (5,),
     ("obs", "y"): (5,),

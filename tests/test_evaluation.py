@@ -16,12 +16,14 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 
 from hdmi.assembly import make_env
+from hdmi.assets import g1
 from hdmi.config import ConfigError
 from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy, protocol, render_checkpoint, video
 from hdmi.evaluation.agents import BlindAgent, blind_agent
-from hdmi.evaluation.protocol import FirstEpisodes, StartAtFrame, evaluation_config, termination_names
+from hdmi.evaluation.protocol import FirstEpisodes, evaluation_config, termination_names
 from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from hdmi.learning.policy import load_policy, make_networks
+from hdmi.transforms import ReferenceStateInitialization
 
 ROOT = Path(__file__).parents[1]
 
@@ -204,9 +206,10 @@ def test_what_cannot_be_left_out_is_told():
 
 def test_a_start_beyond_the_motion_is_refused():
     reference = lift_box().reference
-    assert StartAtFrame(reference, 7).sample_frames(torch.Size([3]), None).tolist() == [7, 7, 7]
+    starts = ReferenceStateInitialization(reference, g1.JOINT_RANGES, start=7)
+    assert starts.sample_frames(torch.Size([3]), None).tolist() == [7, 7, 7]
     with pytest.raises(ValueError, match="expected a frame from 0 to"):
-        StartAtFrame(reference, reference.num_frames)
+        ReferenceStateInitialization(reference, g1.JOINT_RANGES, start=reference.num_frames)
 
 
 # -- environments ---------------------------------------------------------------------------------------------

@@ -64,7 +64,7 @@ def test_no_contact_is_deep_whatever_the_objects_size(name: str) -> None:
 def test_noise_stays_in_the_joint_ranges(name: str) -> None:
     task, cfg = task_of(name), load_config(f"task={name}")
     noise = OmegaConf.to_container(load_config("task=move_suitcase").reset.state.noise)  # the widest
-    init = T.ReferenceStateInitialization(task.reference, noise=noise, starts=task.starts)
+    init = T.ReferenceStateInitialization(task.reference, g1.JOINT_RANGES, noise=noise, starts=task.starts)
     torch.manual_seed(0)
     frames = torch.randint(task.reference.num_frames, (4000,))
     scale = 0.9 + 0.2 * torch.rand(4000, 1) if cfg.randomization.object_scale is not None else None
@@ -134,13 +134,17 @@ def test_hands_go_where_the_contact_points_go():
 
 def test_supports_move_with_what_they_carry_and_only_then():
     _, reference, tables = tables_of((3.0, 0.0, 0.7), (3.0, 0.0, 0.3))
-    init = T.ReferenceStateInitialization(reference, noise={"object_pos": [0.05, 0.05, 0.0]}, starts=tables)
+    init = T.ReferenceStateInitialization(
+        reference, g1.JOINT_RANGES, noise={"object_pos": [0.05, 0.05, 0.0]}, starts=tables
+    )
     state = init.initial_state(torch.zeros(5, dtype=torch.int64))
     moved = state["object_pos"] - reference.object_pos[0]
     assert moved[:, :2].abs().min() > 1e-4
     torch.testing.assert_close(state["scenery_pos"][:, 0] - torch.tensor([3.0, 0.0, 0.3]), moved)
     _, reference, tables = tables_of((3.0, 0.0, 0.7))
-    init = T.ReferenceStateInitialization(reference, noise={"object_pos": [0.05, 0.05, 0.0]}, starts=tables)
+    init = T.ReferenceStateInitialization(
+        reference, g1.JOINT_RANGES, noise={"object_pos": [0.05, 0.05, 0.0]}, starts=tables
+    )
     assert "scenery_pos" not in init.initial_state(torch.zeros(5, dtype=torch.int64))
 
 
@@ -194,7 +198,7 @@ def test_rows_that_reset_are_drawn_again_and_others_stay():
 
 def test_a_start_keeps_its_frame_when_it_is_drawn_again():
     task = task_of("move_suitcase")
-    init = T.ReferenceStateInitialization(task.reference, noise={"joint_pos": 0.1}, starts=task.starts)
+    init = T.ReferenceStateInitialization(task.reference, g1.JOINT_RANGES, noise={"joint_pos": 0.1}, starts=task.starts)
     given = {"frame": torch.tensor([[7], [30]]), "noise_share": torch.tensor([[0.0], [0.5]])}
     out = init._reset_env_preprocess(TensorDict({"init": given}, batch_size=[2]))["init"]
     assert out["frame"].flatten().tolist() == [7, 30]

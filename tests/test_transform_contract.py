@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import copy
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
 import pytest
 import torch
-from mocks import ScriptedEnv, assert_same, drive, lift_box, make_script, wrap
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from mocks import ScriptedEnv, assert_same, constant, drive, lift_box, make_script, wrap
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+import hdmi.functional as F
 import hdmi.transforms as T
-from hdmi.assets import Effector
+from hdmi.assets import Effector, default_joint_pos, g1
 
 N = 3
 EFFECTORS = (
@@ -30,59 +32,96 @@ ROBOT_BODY = tuple(("robot", f"body_{key}") for key in ("pos", "quat", "lin_vel"
 ROOT = (("robot", "root_pos"), ("robot", "root_quat"))
 CONTACT = (("contact", "eef_pos"), ("contact", "target_pos"), ("contact", "force"), ("ref", "contact"))
 X, Y, POSE = ("obs", "x"), ("obs", "y"), ("obs", "pose")
+QUAT = ROBOT_BODY[1]
+
+
+Rename = Callable[[NestedKey], NestedKey]
 
 
 @dataclass(frozen=True)
 class Case:
     """How to make a transform, and what it must find.
 
+    build: makes it from the required keys, which go through `r`, and keywords for the other ones.
     kind: `function` of the entries of one step; `reward` of those of the next step; `inverse`, rewrites the action;
     `state`, carries state from step to step; `init`, writes what the environment resets to.
     random: draws numbers. ends: may end episodes.
     """
 
-    make: Callable[[], Transform]
+    build: Callable[..., Transform]
     kind: str
     reads: tuple[NestedKey, ...] = ()
     random: bool = False
     ends: bool = False
 
+    def make(self) -> Transform:
+        """With the keys that it has by default."""
+        return self.build(lambda key: key)
 
-def lazy(name: str, **kwargs) -> Callable[[], Transform]:
+
+def lazy(name: str, **kwargs) -> Callable[..., Transform]:
     """A transform that needs the model or the reference of the embedded task."""
 
-    def make() -> Transform:
+    def build(r: Rename, **keys) -> Transform:
         cls = getattr(T, name)
         task = lift_box()
-        given = {"model": task.scene.model, "reference": task.reference}
-        wanted = {key: given[key] for key in ("model", "reference") if key in cls.__init__.__code__.co_varnames}
-        return cls(**wanted, **kwargs)
+        given = {
+            "model": task.scene.model,
+            "reference": task.reference,
+            "body_names": g1.BODY_NAMES,
+            "joint_names": g1.JOINT_NAMES,
+            "joint_ranges": g1.JOINT_RANGES,
+        }
+        parameters = cls.__init__.__code__.co_varnames[: cls.__init__.__code__.co_argcount]
+        wanted = {key: value for key, value in given.items() if key in parameters}
+        return cls(**wanted, **kwargs, **keys)
 
-    return make
+    return build
 
 
+def motion_end(r: Rename, **keys) -> Transform:
+    end = T.MotionEnd(lift_box().reference, **keys)
+    end.last = 5
+    return end
+
+
+def object_joint(r: Rename, **keys) -> Transform:
+    # any hinge will do; the embedded object has none
+    return T.ObjectJointRandomization(lift_box().scene.model, "waist_yaw_joint", [0.1, 0.2], [0.3, 0.4], **keys)
+
+
+ERRORS = (("error", "many"), ("error", "one"))
 CASES: dict[str, Case] = {
-    "AbsoluteDifference": Case(lambda: T.AbsoluteDifference(X, Y, "out", [0, 2]), "function", (X, Y)),
-    "ActionDelay": Case(lambda: T.ActionDelay((2, 6), 4, size=4), "state", random=True),
-    "ActionHistory": Case(lambda: T.ActionHistory(3, 4, action_key="action"), "state"),
-    "ActionRateL2": Case(T.ActionRateL2, "reward", ("action_history",)),
-    "ActionSmoothing": Case(lambda: T.ActionSmoothing(size=4), "state", random=True),
+    "AbsoluteDifference": Case(
+        lambda r, **k: T.AbsoluteDifference(r(X), r(Y), r("out"), [0, 2], **k), "function", (X, Y)
+    ),
+    "ActionDelay": Case(lambda r, **k: T.ActionDelay((2, 6), 4, **k), "state", random=True),
+    "ActionHistory": Case(
+        lambda r, **k: T.ActionHistory(3, **({"action_key": "action"} | k | {"action_key": r("action")})), "state"
+    ),
+    "ActionRateL2": Case(lambda r, **k: T.ActionRateL2(**k), "reward", ("action_history",)),
+    "ActionSmoothing": Case(lambda r, **k: T.ActionSmoothing(**k), "state", random=True),
     "AdaptiveStateInitialization": Case(
         lazy("AdaptiveStateInitialization", lead=0), "init", (("ref", "step"),), random=True
     ),
-    "Angle": Case(lambda: T.Angle(ROBOT_BODY[1], ROBOT_BODY[1], "out"), "function", (ROBOT_BODY[1],)),
-    "BodyHeight": Case(lambda: T.BodyHeight(threshold=0.5, min_steps=2), "state", (ROBOT_BODY[0],), ends=True),
-    "BodyHeightError": Case(
-        lambda: T.BodyHeightError("a", ["a", "b"], ROBOT_BODY[0], ROBOT_BODY[0], "out", ("a", "b", "c")),
-        "function",
+    "Angle": Case(lambda r, **k: T.Angle(r(QUAT), r(QUAT), r("out"), **k), "function", (QUAT,)),
+    "BodyHeight": Case(
+        lambda r, **k: T.BodyHeight("torso_link", g1.BODY_NAMES, threshold=0.5, min_steps=2, **k),
+        "state",
         (ROBOT_BODY[0],),
+        ends=True,
+    ),
+    "BodyHeightError": Case(
+        lambda r, **k: T.BodyHeightError("a", ["a", "b"], ("a", "b", "c"), **k),
+        "function",
+        (("tracked", "body_pos"), ("ref", "body_pos")),
     ),
     "CenterOfMassRandomization": Case(
         lazy("CenterOfMassRandomization", bodies=["pelvis"], shift=0.1), "init", random=True
     ),
-    "ContactMade": Case(T.ContactMade, "function", CONTACT[2:]),
+    "ContactMade": Case(lambda r, **k: T.ContactMade(**k), "function", CONTACT[2:]),
     "ContactPoints": Case(
-        lambda: T.ContactPoints(EFFECTORS),
+        lambda r, **k: T.ContactPoints(EFFECTORS, g1.BODY_NAMES, **k),
         "function",
         (
             *ROBOT_BODY[:2],
@@ -92,81 +131,103 @@ CASES: dict[str, Case] = {
             ("ref", "contact_point"),
         ),
     ),
-    "DefaultPoseAction": Case(lambda: T.DefaultPoseAction([0.1, 0.2, 0.3, 0.4]), "inverse"),
-    "Difference": Case(lambda: T.Difference(X, Y, "out"), "function", (X, Y)),
-    "Distance": Case(lambda: T.Distance(CONTACT[0], CONTACT[1], "out"), "function", CONTACT[:2]),
-    "EpisodeNoise": Case(lambda: T.EpisodeNoise(X, 0.1), "state", (X,), random=True),
+    "DefaultPoseAction": Case(lambda r, **k: T.DefaultPoseAction([0.1, 0.2, 0.3, 0.4], **k), "inverse"),
+    "Difference": Case(lambda r, **k: T.Difference(r(X), r(Y), r("out"), **k), "function", (X, Y)),
+    "Distance": Case(lambda r, **k: T.Distance(r(CONTACT[0]), r(CONTACT[1]), r("out"), **k), "function", CONTACT[:2]),
+    "EpisodeNoise": Case(lambda r, **k: T.EpisodeNoise(r(X), 0.1, **k), "state", (X,), random=True),
     "ErrorTermination": Case(
-        lambda: T.ErrorTermination("error", [("error", "many"), ("error", "one")], [1.5, 0.8], min_steps=2),
+        lambda r, **k: T.ErrorTermination("error", [r(e) for e in ERRORS], [1.5, 0.8], min_steps=2, **k),
         "state",
-        (("error", "many"), ("error", "one")),
+        ERRORS,
         ends=True,
     ),
-    "FeetAirTime": Case(T.FeetAirTime, "reward", (("feet", "swing_time"), ("feet", "touchdown"))),
-    "FeetImpactL2": Case(T.FeetImpactL2, "reward", (("feet", "force"), ("feet", "previous_force"))),
-    "FeetSlip": Case(
-        lambda: T.FeetSlip(force_threshold=0.5), "reward", (("robot", "body_lin_vel"), ("robot", "foot_force"))
+    "FeetAirTime": Case(lambda r, **k: T.FeetAirTime(**k), "reward", (("feet", "swing_time"), ("feet", "touchdown"))),
+    "FeetImpactL2": Case(
+        lambda r, **k: T.FeetImpactL2(35.0, **k), "reward", (("feet", "force"), ("feet", "previous_force"))
     ),
-    "FeetStumble": Case(lambda: T.FeetStumble(ratio=1.0), "reward", (("robot", "foot_force"),)),
-    "FeetState": Case(lambda: T.FeetState(0.02, force_threshold=1.5), "state", (("robot", "foot_force"),)),
-    "Flatten": Case(lambda: T.Flatten(CONTACT[2], "out"), "function", (CONTACT[2],)),
+    "FeetSlip": Case(
+        lambda r, **k: T.FeetSlip(g1.FEET, g1.BODY_NAMES, force_threshold=0.5, **k),
+        "reward",
+        (("robot", "body_lin_vel"), ("robot", "foot_force")),
+    ),
+    "FeetStumble": Case(lambda r, **k: T.FeetStumble(ratio=1.0, **k), "reward", (("robot", "foot_force"),)),
+    "FeetState": Case(lambda r, **k: T.FeetState(0.02, force_threshold=1.5, **k), "state", (("robot", "foot_force"),)),
+    "Flatten": Case(lambda r, **k: T.Flatten(r(CONTACT[2]), r("out"), **k), "function", (CONTACT[2],)),
     "FrictionRandomization": Case(
         lazy("FrictionRandomization", bodies=["pelvis"], friction=[0.5, 1.0]), "init", random=True
     ),
-    "HeadingNoise": Case(lambda: T.HeadingNoise(POSE, 0.1), "function", (POSE,), random=True),
-    "History": Case(lambda: T.History(X, 2), "state", (X,)),
-    "InteractionReward": Case(T.InteractionReward, "reward", CONTACT),
-    "JointErrors": Case(lambda: T.JointErrors(X, Y, "out", ["[ac]_joint"], (*JOINTS, "e_joint")), "function", (X, Y)),
-    "JointOffset": Case(lambda: T.JointOffset(0.1, size=4), "state", random=True),
-    "JointPosLimitsL1": Case(T.JointPosLimitsL1, "reward", (("robot", "joint_pos"),)),
-    "JointPositionAction": Case(lambda: T.JointPositionAction({"[ac]_joint": 0.5}, JOINTS), "inverse"),
-    "JointTorqueLimitsL1": Case(
-        lambda: T.JointTorqueLimitsL1(limits=[0.5] * 29), "reward", (("robot", "joint_torque"),)
+    "HeadingNoise": Case(lambda r, **k: T.HeadingNoise(r(POSE), 0.1, **k), "function", (POSE,), random=True),
+    "History": Case(lambda r, **k: T.History(r(X), 2, **k), "state", (X,)),
+    "InteractionReward": Case(lambda r, **k: T.InteractionReward(**k), "reward", CONTACT),
+    "JointErrors": Case(
+        lambda r, **k: T.JointErrors(r(X), r(Y), r("out"), ["[ac]_joint"], (*JOINTS, "e_joint"), **k),
+        "function",
+        (X, Y),
     ),
-    "JointVelL2": Case(T.JointVelL2, "reward", (("robot", "joint_vel"),)),
-    "LostContact": Case(lambda: T.LostContact(min_force=2.0, min_steps=2), "state", CONTACT, ends=True),
+    "JointOffset": Case(lambda r, **k: T.JointOffset(0.1, **k), "state", random=True),
+    "JointPosLimitsL1": Case(
+        lambda r, **k: T.JointPosLimitsL1(g1.JOINT_RANGES, **k), "reward", (("robot", "joint_pos"),)
+    ),
+    "JointPositionAction": Case(lambda r, **k: T.JointPositionAction({"[ac]_joint": 0.5}, JOINTS, **k), "inverse"),
+    "JointTorqueLimitsL1": Case(
+        lambda r, **k: T.JointTorqueLimitsL1([0.5] * 29, **k), "reward", (("robot", "joint_torque"),)
+    ),
+    "JointVelL2": Case(lambda r, **k: T.JointVelL2(**k), "reward", (("robot", "joint_vel"),)),
+    "KernelReward": Case(
+        lambda r, **k: T.KernelReward("hdmi.functional.tracking", [r(("error", "many"))], "near", 2.0, sigma=0.5, **k),
+        "reward",
+        (("error", "many"),),
+    ),
+    "KernelTermination": Case(
+        lambda r, **k: T.KernelTermination(
+            F.any_error_exceeds, [r(e) for e in ERRORS], "far", 2, thresholds=(1.5, 0.8), **k
+        ),
+        "state",
+        ERRORS,
+        ends=True,
+    ),
+    "LostContact": Case(lambda r, **k: T.LostContact(min_force=2.0, min_steps=2, **k), "state", CONTACT, ends=True),
     "MassRandomization": Case(lazy("MassRandomization", bodies=["pelvis"], scale=[0.5, 2.0]), "init", random=True),
-    "Metrics": Case(lambda: T.Metrics({"many": ["error", "many"], "absent": None}), "function", (("error", "many"),)),
-    "MotionEnd": Case(lambda: _motion_end(), "state", (("ref", "step"),), ends=True),
+    "Metrics": Case(
+        lambda r, **k: T.Metrics({"many": r(("error", "many")), "absent": None}, **k), "function", (("error", "many"),)
+    ),
+    "MotionEnd": Case(motion_end, "state", (("ref", "step"),), ends=True),
     "MotionReference": Case(
         lazy("MotionReference", tracked_bodies=["pelvis", "torso_link"], tracked_joints=["waist_.*"]), "state"
     ),
-    "ObjectJointRandomization": Case(lambda: _object_joint(), "init", random=True),
-    "ObjectScale": Case(lambda: T.ObjectScale([0.9, 1.1]), "init", random=True),
-    "PointInRoot": Case(lambda: T.PointInRoot(CONTACT[0], "out"), "function", (CONTACT[0], *ROOT)),
+    "ObjectJointRandomization": Case(object_joint, "init", random=True),
+    "ObjectScale": Case(lambda r, **k: T.ObjectScale([0.9, 1.1], **k), "init", random=True),
+    "PointInRoot": Case(lambda r, **k: T.PointInRoot(r(CONTACT[0]), r("out"), **k), "function", (CONTACT[0], *ROOT)),
     "PoseInRoot": Case(
-        lambda: T.PoseInRoot(("object", "pos"), ("object", "quat"), "out"),
+        lambda r, **k: T.PoseInRoot(r(("object", "pos")), r(("object", "quat")), r("out"), **k),
         "function",
         (("object", "pos"), ("object", "quat"), *ROOT),
     ),
-    "ProjectedGravity": Case(lambda: T.ProjectedGravity("out"), "function", ROOT[1:]),
-    "RandomPush": Case(lambda: T.RandomPush([2, 3], [1.0] * 3, [1.0] * 3), "state", random=True),
+    "ProjectedGravity": Case(lambda r, **k: T.ProjectedGravity(r("out"), **k), "function", ROOT[1:]),
+    "RandomPush": Case(lambda r, **k: T.RandomPush([2, 3], [1.0] * 3, [1.0] * 3, **k), "state", random=True),
     "ReferenceStateInitialization": Case(lazy("ReferenceStateInitialization"), "init", random=True),
-    "RelativeJointPos": Case(lambda: T.RelativeJointPos("out"), "function", (("robot", "joint_pos"),)),
-    "ResidualAction": Case(T.ResidualAction, "inverse", (("ref", "joint_pos"),)),
-    "RewardRate": Case(lambda: T.RewardRate(0.02), "reward"),
-    "SurvivalReward": Case(T.SurvivalReward, "reward"),
-    "TrackedBodies": Case(lambda: T.TrackedBodies([".*_knee_link", "pelvis"]), "function", (*ROBOT_BODY, *ROOT)),
-    "TrackingReward": Case(
-        lambda: T.TrackingReward("pose", 2.0, [("error", "many"), ("error", "one")], [0.5, 1.0], [0.0, 0.1]),
-        "reward",
-        (("error", "many"), ("error", "one")),
+    "RelativeJointPos": Case(
+        lambda r, **k: T.RelativeJointPos(r("out"), default_joint_pos(), **k), "function", (("robot", "joint_pos"),)
     ),
-    "UniformNoise": Case(lambda: T.UniformNoise(X, 0.1), "function", (X,), random=True),
-    "VectorInRoot": Case(lambda: T.VectorInRoot(CONTACT[2], "out"), "function", (CONTACT[2], ROOT[1])),
+    "ResidualAction": Case(lambda r, **k: T.ResidualAction(**k), "inverse", (("ref", "joint_pos"),)),
+    "RewardRate": Case(lambda r, **k: T.RewardRate(0.02, **k), "reward"),
+    "SurvivalReward": Case(lambda r, **k: T.SurvivalReward(**k), "reward"),
+    "TrackedBodies": Case(
+        lambda r, **k: T.TrackedBodies([".*_knee_link", "pelvis"], g1.BODY_NAMES, **k),
+        "function",
+        (*ROBOT_BODY, *ROOT),
+    ),
+    "TrackingReward": Case(
+        lambda r, **k: T.TrackingReward("pose", 2.0, [r(e) for e in ERRORS], [0.5, 1.0], [0.0, 0.1], **k),
+        "reward",
+        ERRORS,
+    ),
+    "UniformNoise": Case(lambda r, **k: T.UniformNoise(r(X), 0.1, **k), "function", (X,), random=True),
+    "VectorInRoot": Case(
+        lambda r, **k: T.VectorInRoot(r(CONTACT[2]), r("out"), **k), "function", (CONTACT[2], ROOT[1])
+    ),
 }
 BASES = {"RewardTerm", "TerminationTerm"}
-
-
-def _motion_end() -> Transform:
-    end = T.MotionEnd(lift_box().reference)
-    end.last = 5
-    return end
-
-
-def _object_joint() -> Transform:
-    # any hinge will do; the embedded object has none
-    return T.ObjectJointRandomization(lift_box().scene.model, "waist_yaw_joint", [0.1, 0.2], [0.3, 0.4])
 
 
 def base(case: Case, **kwargs) -> ScriptedEnv:
@@ -253,6 +314,122 @@ class TestEnvironments:
             assert_same(step, copied)
 
 
+# -- keys -------------------------------------------------------------------------------------------------------------
+
+SHARED = ("action_key", "env_action_key", "reward_key", "terminated_key", "truncated_key", "done_key", "worlds_key")
+
+
+def new(key: NestedKey) -> NestedKey:
+    """Another name for a key, in one subtree with all others."""
+    return unravel_key(("new", key))
+
+
+def keywords(name: str, rename: Rename, leave: tuple[str, ...] = ()) -> dict[str, NestedKey]:
+    """All keys of a transform that are keywords, renamed; those that follow from others get a name of their own."""
+    parameters = inspect.signature(getattr(T, name).__init__).parameters.values()
+    given = {p.name: p.default for p in parameters if p.name.endswith("_key") and p.default is not p.empty}
+    own = {key: ("own", key) if value is None else value for key, value in given.items()}
+    return {key: value if key in leave else rename(value) for key, value in own.items()}
+
+
+def spelled(name: str, rename: Rename) -> tuple[TransformedEnv, list[TensorDict]]:
+    """An environment whose every entry is renamed, under the transform with every key renamed; and three steps."""
+    case, done_group = CASES[name], None if rename("done") == "done" else "new"
+    script = {rename(key): value for key, value in make_script(case.reads, N).items()}
+    env = ScriptedEnv(script, 4, None, True, rename("action"), rename("reward"), done_group)
+    env = wrap(env, case.build(rename, **keywords(name, rename)))
+    torch.manual_seed(0)
+    start = env.reset()
+    return env, [start.clone(), *drive(env, 3, start=start)]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_key_is_an_argument(name):
+    """With other names for all entries nothing changes but the names, and no entry has a name of ours."""
+    env, steps = spelled(name, lambda key: key)
+    other, renamed_steps = spelled(name, new)
+    for step, renamed in zip(steps, renamed_steps, strict=True):
+        for part in ("next", None):
+            ours, theirs = (td if part is None else td.get(part, None) for td in (step, renamed))
+            if ours is None:
+                continue
+            ours, theirs = ours.exclude("next"), theirs.exclude("next")
+            assert {key[0] for key in theirs.keys(True, True)} == {"new"}
+            assert_same(theirs["new"], ours)
+    asked = [td if td is None else td.exclude("_reset") for td in (env.base_env.asked, other.base_env.asked)]
+    if CASES[name].kind == "init":
+        assert_same(asked[1]["new"], asked[0])
+    check_env_specs(other)
+
+
+# A target per joint becomes one per physics step, and few joints' become all joints': once.
+ONCE = ("ActionDelay", "JointPositionAction")
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if name not in ONCE])
+def test_two_of_a_kind_share_nothing(name):
+    """One over ours and one over renamed entries, in one stack: each does what it does alone."""
+    case = CASES[name]
+    script = make_script(case.reads, N)
+    both = script | {new(key): value for key, value in script.items()}
+    second = (
+        case.build(new, **keywords(name, new, SHARED))
+        if name != "ActionHistory"
+        else T.ActionHistory(3, action_key="action", out_key=("new", "action_history"))
+    )
+    env = wrap(ScriptedEnv(both), case.make(), second)
+    check_env_specs(env)
+    alone = drive(env_of(name), 4)
+    together = drive(env, 4)
+    kept = set(alone[-1].keys(True, True)) - {"reward", ("next", "reward")}
+    written = {key for key in kept if key in together[-1].keys(True, True)}
+    assert written == kept
+    if case.random or case.kind == "inverse":
+        return
+    for a, b in zip(alone, together, strict=True):
+        assert_same(b.select(*kept), a.select(*kept))
+        ours = [key for key in case.make().out_keys if key in a["next"].keys(True, True)]
+        for key in ours if case.kind == "function" else ():
+            assert torch.equal(b["next"].get(new(key)), a["next"].get(key))
+
+
+@pytest.mark.parametrize("name", [name for name in names(kind="state") if name != "MotionEnd"])
+def test_state_of_another_is_refused(name):
+    with pytest.raises(ValueError, match=f"{name}: its state would be kept at .* give it another key"):
+        wrap(base(CASES[name]), CASES[name].make(), CASES[name].make()).full_observation_spec  # noqa: B018
+
+
+def test_states_of_entries_with_one_last_name():
+    """Two histories of entries that end alike, as policy and critic may have."""
+    script = {("policy", "x"): constant([1.0], N, 4), ("critic", "x"): constant([2.0], N, 4)}
+    env = wrap(ScriptedEnv(script), T.History(("policy", "x"), 1), T.History(("critic", "x"), 1))
+    step = drive(env, 1)[0]["next"]
+    assert step["policy", "x"][0].tolist() == [1.0, 1.0]
+    assert step["critic", "x"][0].tolist() == [2.0, 2.0]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_specs_that_are_given_are_left_alone(name):
+    env, transform = base(CASES[name]), CASES[name].make()
+    around = wrap(env, transform)
+    specs = {
+        "output": env.output_spec.clone(),
+        "input": env.input_spec.clone(),
+        "observation": env.full_observation_spec.clone(),
+        "reward": env.full_reward_spec.clone(),
+        "done": env.full_done_spec.clone(),
+    }
+    for part, spec in specs.items():
+        before = spec.clone()
+        getattr(transform, f"transform_{part}_spec")(spec)
+        assert spec == before
+    around.full_observation_spec  # noqa: B018
+    assert env.output_spec == specs["output"]
+    assert env.input_spec == specs["input"]
+
+
+# -- batches of environments ------------------------------------------------------------------------------------------
+
 # What the environment must read besides its own keys, or in another shape, does not pass through a batch of
 # environments: these stand next to the base environment.
 NEXT_TO_THE_BASE = {"ActionDelay", "RandomPush", *(name for name in CASES if CASES[name].kind == "init")}
@@ -316,7 +493,7 @@ def test_parallel():
         env.close()
     assert got.shape == (2, N, 5)
     alone = drive(wrap(base(REPRESENTATIVE), *lower(), *upper()), 5, lambda t: got["action"][1, :, t])
-    drawn = [Y, ("episode_noise", "y")]
+    drawn = [Y, ("episode_noise", "obs", "y")]
     drawn += [("next", *key) for key in drawn]
     for t, step in enumerate(alone):
         # action transforms note what they did in what their environment is given
@@ -464,7 +641,7 @@ class TestPartialReset:
         fresh = env.reset()
         last = env.step_mdp(drive(env, 3, start=fresh.clone())[-1])
         before = last.clone()
-        after = self.reset(env, last).exclude("_reset", "reward_terms", "reward", "init")
+        after = self.reset(env, last).exclude("_reset", "reward", "init")
         shared = [key for key in fresh.keys(True, True) if key in after.keys(True, True)]
         assert set(env.full_state_spec.keys(True, True)) <= set(after.keys(True, True))
         assert_same(after.select(*shared), before.select(*shared), ~self.mask)
@@ -492,10 +669,10 @@ class TestPartialReset:
     def test_draws_of_other_rows_stay(self, name):
         """What is drawn per episode is drawn anew for the reset rows only."""
         drawn = {
-            "ActionDelay": ("delay", "substeps"),
-            "ActionSmoothing": ("smoothing", "alpha"),
-            "EpisodeNoise": ("episode_noise", "x"),
-            "JointOffset": "joint_offset",
+            "ActionDelay": ("delay", "action", "substeps"),
+            "ActionSmoothing": ("smoothing", "action", "alpha"),
+            "EpisodeNoise": ("episode_noise", "obs", "x"),
+            "JointOffset": ("joint_offset", "action"),
         }
         if name not in drawn:
             pytest.skip("draws in every step")

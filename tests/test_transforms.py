@@ -10,7 +10,9 @@ import torch
 from mocks import ScriptedEnv, constant, drive, lift_box, make_script, wrap
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.envs.utils import check_env_specs
 
+import hdmi.functional as F
 import hdmi.transforms as T
 from hdmi.assets import Effector, default_joint_pos, g1
 from hdmi.envs import BatchBackend, HumanoidObjectEnv
@@ -63,8 +65,10 @@ class TestMotionReference:
             def sample_frames(self, batch_size, device):
                 return torch.full(batch_size, start, dtype=torch.int64)
 
-        motion = T.MotionReference(reference, ["pelvis", "torso_link"], ["waist_.*"], **kwargs)
-        return wrap(blank(2), Start(reference), motion)
+        motion = T.MotionReference(
+            reference, ["pelvis", "torso_link"], ["waist_.*"], g1.BODY_NAMES, g1.JOINT_NAMES, **kwargs
+        )
+        return wrap(blank(2), Start(reference, g1.JOINT_RANGES), motion)
 
     def test_clock_starts_at_the_frame_of_the_reset_and_stays_at_the_end(self, reference):
         last = reference.num_frames - 1
@@ -78,7 +82,7 @@ class TestMotionReference:
         close(steps[-1]["next", "ref", "joint_pos"][1], reference.joint_pos[last])
 
     def test_without_a_frame_it_starts_at_the_first(self, reference):
-        env = wrap(blank(2), T.MotionReference(reference, ["pelvis"], ["waist_.*"]))
+        env = wrap(blank(2), T.MotionReference(reference, ["pelvis"], ["waist_.*"], g1.BODY_NAMES, g1.JOINT_NAMES))
         start = env.reset()
         assert start["ref", "step"].flatten().tolist() == [0, 0]
         close(start["ref", "phase"], [[0.0], [0.0]])
@@ -117,8 +121,8 @@ NOISE = {"root_pos": [0.1, 0.0, 0.05], "joint_pos": 0.2, "object_pos": [0.0, 0.1
 
 class TestReferenceStateInitialization:
     def test_without_noise_physics_starts_in_the_reference_state(self, reference):
-        motion = T.MotionReference(reference, ["pelvis"], ["waist_.*"])
-        td = physics(8, T.ReferenceStateInitialization(reference), motion).reset()
+        motion = T.MotionReference(reference, ["pelvis"], ["waist_.*"], g1.BODY_NAMES, g1.JOINT_NAMES)
+        td = physics(8, T.ReferenceStateInitialization(reference, g1.JOINT_RANGES), motion).reset()
         frames = td["ref", "step"].squeeze(-1)
         assert len(frames.unique()) > 1
         robot, object_ = td["robot"], td["object"]
@@ -136,7 +140,7 @@ class TestReferenceStateInitialization:
         close(object_["ang_vel"], reference.object_ang_vel[frames], 1e-4)
 
     def test_noise_is_uniform_within_its_half_range(self, reference):
-        init = T.ReferenceStateInitialization(reference, noise=NOISE)
+        init = T.ReferenceStateInitialization(reference, g1.JOINT_RANGES, noise=NOISE)
         frames = torch.randint(init.num_starts, (2000,), generator=torch.Generator().manual_seed(0))
         torch.manual_seed(0)
         state = init.initial_state(frames)
@@ -157,18 +161,21 @@ class TestReferenceStateInitialization:
     def test_starts(self, reference):
         count = torch.Size([4000])
         torch.manual_seed(0)
-        first = T.ReferenceStateInitialization(reference, start="first").sample_frames(count, None)
+        first = T.ReferenceStateInitialization(reference, g1.JOINT_RANGES, start="first").sample_frames(count, None)
         assert first.unique().tolist() == [0]
-        frames = T.ReferenceStateInitialization(reference, margin=50).sample_frames(count, None)
+        frames = T.ReferenceStateInitialization(reference, g1.JOINT_RANGES, margin=50).sample_frames(count, None)
         assert frames.min() == 0
         assert frames.max() == reference.num_frames - 51
-        assert T.ReferenceStateInitialization(reference, margin=10**6).sample_frames(count, None).max() == 0
+        assert (
+            T.ReferenceStateInitialization(reference, g1.JOINT_RANGES, margin=10**6).sample_frames(count, None).max()
+            == 0
+        )
 
     def test_errors_name_the_value(self, reference):
         with pytest.raises(ValueError, match=r"reset\.noise: unknown \['root_color'\]"):
-            T.ReferenceStateInitialization(reference, noise={"root_color": 1.0})
+            T.ReferenceStateInitialization(reference, g1.JOINT_RANGES, noise={"root_color": 1.0})
         with pytest.raises(ValueError, match=r"reset\.start.*'last'"):
-            T.ReferenceStateInitialization(reference, start="last")
+            T.ReferenceStateInitialization(reference, g1.JOINT_RANGES, start="last")
 
 
 class TestAdaptiveStateInitialization:
@@ -182,7 +189,7 @@ class TestAdaptiveStateInitialization:
 
     def make(self, reference, **kwargs):
         # 300 frames: with 10 bins and this margin, 29 frames to a bin
-        return T.AdaptiveStateInitialization(reference, margin=10, bins=10, **({"lead": 0} | kwargs))
+        return T.AdaptiveStateInitialization(reference, g1.JOINT_RANGES, margin=10, bins=10, **({"lead": 0} | kwargs))
 
     def fail_at(self, init, *frames: int, terminated: bool = True) -> None:
         n = len(frames)
@@ -245,7 +252,7 @@ class TestJointPositionAction:
         close(td["action"], [[1.0, 3.0]])
 
     def test_defaults_follow_the_robot(self):
-        action = T.JointPositionAction({".*_knee_joint": 0.35})
+        action = T.JointPositionAction({".*_knee_joint": 0.35}, g1.JOINT_NAMES)
         knees = [g1.JOINT_NAMES.index(f"{side}_knee_joint") for side in ("left", "right")]
         assert action.index.tolist() == sorted(knees)
         env = wrap(ScriptedEnv(make_script([], 2), action_size=29), action)
@@ -253,7 +260,7 @@ class TestJointPositionAction:
 
     def test_unknown_joint(self):
         with pytest.raises(ValueError, match="tail_joint"):
-            T.JointPositionAction({"tail_joint": 1.0})
+            T.JointPositionAction({"tail_joint": 1.0}, g1.JOINT_NAMES)
 
 
 def test_residual_is_added_to_the_reference_of_the_present_step():
@@ -268,7 +275,10 @@ def test_residual_is_added_to_the_reference_of_the_present_step():
 
 def test_default_pose_is_the_robots_unless_given():
     zero = TensorDict({"action": torch.zeros(1, 29)}, batch_size=[1])
-    close(T.DefaultPoseAction().inv(zero)["action"][0], torch.as_tensor(default_joint_pos(), dtype=torch.float32))
+    close(
+        T.DefaultPoseAction(default_joint_pos()).inv(zero)["action"][0],
+        torch.as_tensor(default_joint_pos(), dtype=torch.float32),
+    )
     one = TensorDict({"action": torch.ones(1, 2)}, batch_size=[1])
     close(T.DefaultPoseAction([0.5, -0.5]).inv(one)["action"], [[1.5, 0.5]])
 
@@ -286,7 +296,7 @@ class TestActionSmoothing:
     def test_alpha_is_drawn_per_episode_within_its_range(self):
         env = wrap(blank(200), T.ActionSmoothing(alpha=(0.6, 0.9), size=4))
         torch.manual_seed(0)
-        alpha = env.reset()["smoothing", "alpha"]
+        alpha = env.reset()["smoothing", "action", "alpha"]
         assert 0.6 <= alpha.min() < 0.65
         assert 0.85 < alpha.max() <= 0.9
 
@@ -324,7 +334,7 @@ class TestActionDelay:
     def test_all_delays_of_the_range_are_drawn(self):
         env = wrap(blank(300), T.ActionDelay((2, 6), decimation=4, size=4))
         torch.manual_seed(0)
-        assert env.reset()["delay", "substeps"].unique().tolist() == [2, 3, 4, 5, 6]
+        assert env.reset()["delay", "action", "substeps"].unique().tolist() == [2, 3, 4, 5, 6]
 
     def test_a_new_episode_forgets(self):
         env = wrap(blank(2), T.ActionDelay((4, 4), decimation=4, size=4))
@@ -591,7 +601,7 @@ class TestFrames:
         assert T.Flatten("flag", "flags")(data)["flags"].tolist() == [[1.0, 0.0]]
         close(T.Difference("a", "b", "off")(data)["off"], [[-1.0, 0, 1, 2, 3, 4]])
         data["joints"] = torch.tensor([[1.0, 2.0]])
-        close(T.RelativeJointPos("relative", "joints", [0.5, 0.5])(data)["relative"], [[0.5, 1.5]])
+        close(T.RelativeJointPos("relative", [0.5, 0.5], "joints")(data)["relative"], [[0.5, 1.5]])
 
 
 # -- reward -----------------------------------------------------------------------------------------------------------
@@ -621,23 +631,23 @@ TERMS = {
         5.0,
     ),
     "joint_pos_limits": (
-        lambda: T.JointPosLimitsL1("t", soft_limit=0.5, limits=[(-2.0, 2.0), (0.0, 4.0)]),
+        lambda: T.JointPosLimitsL1([(-2.0, 2.0), (0.0, 4.0)], "t", soft_limit=0.5),
         {("robot", "joint_pos"): [1.5, 0.25]},  # allowed: -1 to 1 and 1 to 3
         0.5 + 0.75,
     ),
     "joint_vel": (lambda: T.JointVelL2("t"), {("robot", "joint_vel"): [1.0, -2.0]}, 5.0),
     "joint_torque_limits": (
-        lambda: T.JointTorqueLimitsL1("t", soft_limit=0.5, limits=[10.0, 20.0]),
+        lambda: T.JointTorqueLimitsL1([10.0, 20.0], "t", soft_limit=0.5),
         {("robot", "joint_torque"): [-8.0, 9.0]},
         3.0,
     ),
     "feet_impact": (
-        lambda: T.FeetImpactL2("t", weight_force=50.0),
+        lambda: T.FeetImpactL2(50.0 / 9.81, "t"),
         {("feet", "force"): FORCE, ("feet", "previous_force"): torch.zeros(2, 3)},
         4.0,
     ),
     "feet_slip": (
-        lambda: T.FeetSlip("t", body_names=("a", "l", "r"), feet=("l", "r")),
+        lambda: T.FeetSlip(("l", "r"), ("a", "l", "r"), "t"),
         {("robot", "body_lin_vel"): [[9.0, 9, 9], [0.3, 0.4, 7.0], [1.0, 0, 0]], ("robot", "foot_force"): FORCE},
         0.5,
     ),
@@ -708,6 +718,64 @@ def test_tracking_refuses_unpaired_errors_and_sigmas():
         T.TrackingReward("t", 1.0, ["a"], [0.0])
 
 
+class TestKernelReward:
+    """A row of the table that is config alone."""
+
+    def test_a_kernel_of_ones_own(self):
+        def near(a, b, *, reach):
+            return (reach - (a - b).abs()).clamp(min=0)
+
+        env = wrap(
+            ScriptedEnv({"a": constant([1.0]), "b": constant([3.5])}),
+            T.KernelReward(near, ["a", "b"], "t", 2.0, reach=3.0),
+        )
+        close(drive(env, 1)[0]["next", "reward"], [[2 * 0.5]])
+
+    def test_tensors_among_the_parameters_move_with_it(self):
+        term = T.KernelReward(F.limit_excess, ["a"], "t", low=torch.zeros(2), high=torch.ones(2))
+        close(drive(wrap(ScriptedEnv({"a": constant([1.5, -1.0])}), term), 1)[0]["next", "reward"], [[1.5]])
+        assert term.to(torch.float64).kernel.low.dtype == torch.float64
+
+    @pytest.mark.parametrize(
+        ("function", "keys", "parameters", "message"),
+        [
+            ("hdmi.functional.nothing", ["a"], {}, "there is no function 'hdmi.functional.nothing'"),
+            ("nothing.at.all", ["a"], {}, "there is no function 'nothing.at.all'"),
+            ("hdmi.functional.tracking", ["a"], {}, r"tracking.* does not take 1 keys and \[\]: .*sigma"),
+            ("hdmi.functional.tracking", ["a", "b"], {"sigma": 1.0}, "does not take 2 keys"),
+            ("hdmi.functional.tracking", ["a"], {"sigma": 1.0, "width": 2.0}, "width"),
+            (3, ["a"], {}, "3 is no function"),
+        ],
+    )
+    def test_a_call_that_the_kernel_does_not_take(self, function, keys, parameters, message):
+        with pytest.raises(ValueError, match=f"reward 't': .*{message}"):
+            T.KernelReward(function, keys, "t", **parameters)
+        with pytest.raises(ValueError, match=f"termination 't': .*{message}"):
+            T.KernelTermination(function, keys, "t", **parameters)
+
+    def test_one_figure_for_each_world(self):
+        env = wrap(ScriptedEnv({"a": constant([1.0, 2.0])}), T.KernelReward(torch.abs, ["a"], "t"))
+        with pytest.raises(ValueError, match=r"reward 't': expected one figure for each world, \[1, 1\], got \[1, 2\]"):
+            env.output_spec  # noqa: B018
+
+    def test_the_reward_is_the_only_one(self):
+        """Terms are observations, zero after a reset, so that the environment has one reward key."""
+        env = wrap(
+            ScriptedEnv({"a": constant([1.0])}),
+            T.KernelReward(torch.abs, ["a"], "t", 3.0),
+            T.JointVelL2(joint_vel_key="a"),
+        )
+        assert env.reward_key == "reward"
+        check_env_specs(env)
+        assert env.reset()["reward_terms", "t"].tolist() == [[0.0]]
+
+    def test_terminations(self):
+        far = T.KernelTermination("hdmi.functional.error_exceeds", ["e"], "far", min_steps=2, threshold=1.0)
+        steps = drive(wrap(ScriptedEnv({"e": table([0.0, 2.0, 2.0])}), far), 2)
+        assert [bool(s["next", "terminated"]) for s in steps] == [False, True]
+        assert steps[-1]["next", "termination", "far"].all()
+
+
 # -- termination ------------------------------------------------------------------------------------------------------
 
 
@@ -757,7 +825,7 @@ class TestTermination:
         pos[0, :, 1, 2] = heights
         env = wrap(
             ScriptedEnv({("robot", "body_pos"): pos}),
-            T.BodyHeight(threshold=0.3, min_steps=1, body="torso", body_names=("a", "torso")),
+            T.BodyHeight("torso", ("a", "torso"), threshold=0.3, min_steps=1),
         )
         assert drive(env, 1)[0]["next", "terminated"].flatten().tolist() == [False, True]
 
@@ -917,20 +985,20 @@ def test_joint_offset_is_added_to_every_target():
     env = wrap(blank(50), T.JointOffset(0.1, size=4))
     torch.manual_seed(0)
     td = env.reset()
-    offset = td["joint_offset"].clone()
+    offset = td["joint_offset", "action"].clone()
     assert 0.08 < offset.abs().max() <= 0.1
     for t in range(3):
         td = env.step(td.set("action", torch.full((50, 4), float(t))))
         close(env.base_env.received, offset + t)
         td = env.step_mdp(td)
-    assert not torch.equal(env.reset()["joint_offset"], offset)
+    assert not torch.equal(env.reset()["joint_offset", "action"], offset)
 
 
 def test_joint_offset_on_a_target_per_physics_step():
     env = wrap(blank(2), T.JointOffset(0.1, size=4), T.ActionDelay((2, 2), 4, size=4))
     td = env.reset()
     env.step(td.set("action", torch.ones(2, 4)))
-    close(env.base_env.received, (1 + td["joint_offset"]).unsqueeze(1).expand(2, 4, 4))
+    close(env.base_env.received, (1 + td["joint_offset", "action"]).unsqueeze(1).expand(2, 4, 4))
 
 
 class TestRandomPush:
@@ -940,7 +1008,7 @@ class TestRandomPush:
         pose = torch.as_tensor(default_joint_pos(), dtype=torch.float32).expand(2, 29)
         torch.manual_seed(0)
         a, b = drive(pushed, 3, lambda _: pose), drive(still, 3, lambda _: pose)
-        assert [s["push_countdown"].flatten().tolist() for s in a] == [[2, 2], [1, 1], [2, 2]]
+        assert [s["push_countdown", "push"].flatten().tolist() for s in a] == [[2, 2], [1, 1], [2, 2]]
         key = ("next", "robot", "root_lin_vel")
         torch.testing.assert_close(a[0].get(key), b[0].get(key), rtol=0, atol=0)
         change = (a[1].get(key) - b[1].get(key)).norm(dim=-1)

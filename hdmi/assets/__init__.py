@@ -2,8 +2,9 @@
 
 from hdmi.assets import g1
 from hdmi.assets.objects import GeomConfig, HingeConfig, ObjectConfig, SceneryConfig, parse_geom
-from hdmi.assets.robot import RobotConfig, default_joint_pos, match_names, per_joint
+from hdmi.assets.robot import RobotConfig, default_joint_pos, per_joint
 from hdmi.assets.scene import Effector, Scene, SimConfig, build_scene
+from hdmi.names import match_names
 
 __all__ = [
     "Effector",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ import mujoco
 import numpy as np
 
 from hdmi.assets import g1
+from hdmi.names import match_names
 
 # Bit masks: robot geoms meet floor, scenery and object; each other only with self-collisions.
 ROBOT_BIT, WORLD_BIT = 1, 2
@@ -96,18 +96,6 @@ class RobotConfig:
     def held_joints(self) -> list[str]:
         """Names of the joints that hold the default pose, in table order."""
         return [g1.JOINT_NAMES[i] for i in match_names(self.held, g1.JOINT_NAMES, "robot.held")]
-
-
-def match_names(patterns: Sequence[str], names: Sequence[str], where: str = "names") -> list[int]:
-    """Indices of `names` that fully match any of the regular expressions, in the order of `names`.
-
-    Raises:
-        ValueError: if a pattern matches nothing; names the pattern and what there is.
-    """
-    for pattern in patterns:
-        if not any(re.fullmatch(pattern, name) for name in names):
-            raise ValueError(f"{where}: {pattern!r} matches none of {list(names)}")
-    return [i for i, name in enumerate(names) if any(re.fullmatch(pattern, name) for pattern in patterns)]
 
 
 def per_joint(values: Mapping[str, float], default: float | np.ndarray = 0.0, where: str = "joints") -> np.ndarray:

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 
-from hdmi.motion.starts import FRAME_KEY, NOISE_SHARE_KEY
+from hdmi.names import FRAME_KEY, NOISE_SHARE_KEY
 from hdmi.threads import torch_threads
 
 

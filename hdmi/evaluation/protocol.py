@@ -26,7 +26,6 @@ from hdmi.assembly import Task, make_env, make_task
 from hdmi.config import ConfigError, choose_engine, task_config, task_files
 from hdmi.learning.checkpoint import POLICY_FILE, CheckpointError
 from hdmi.learning.policy import load_policy
-from hdmi.motion import Reference
 from hdmi.transforms import ReferenceStateInitialization
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -63,29 +62,6 @@ def unit_of(figure: str) -> str:
     return UNITS.get(figure.removesuffix(HORIZON), "")
 
 
-class StartAtFrame(ReferenceStateInitialization):
-    """Starts all episodes from one frame of the reference, perturbed.
-
-    Args:
-        frame: of the reference. noise, held_noise: as in `ReferenceStateInitialization`.
-    """
-
-    def __init__(
-        self,
-        reference: Reference,
-        frame: int,
-        noise: Mapping[str, float | Sequence[float]] | None = None,
-        held_noise: float = 1.0,
-    ):
-        super().__init__(reference, "first", 1, noise, held_noise)
-        if not 0 <= frame < reference.num_frames - 1:
-            raise ValueError(f"start: expected a frame from 0 to {reference.num_frames - 2}, got {frame}")
-        self.frame = frame
-
-    def sample_frames(self, batch_size: torch.Size, device: torch.device | None) -> Tensor:
-        return torch.full(tuple(batch_size), self.frame, dtype=torch.int64, device=device)
-
-
 def evaluation_config(
     cfg: DictConfig, terminations: Sequence[str] | None = None, start: int = 0, without: Sequence[str] = ()
 ) -> DictConfig:
@@ -103,10 +79,9 @@ def evaluation_config(
     cfg = copy.deepcopy(cfg)
     with open_dict(cfg):
         node = (cfg.reset or {}).get("state") or {}
-        cls: type = StartAtFrame if start else ReferenceStateInitialization
+        cls = ReferenceStateInitialization
         kept = {key: value for key, value in node.items() if key in inspect.signature(cls).parameters}
-        where = {"frame": start} if start else {"start": "first"}
-        state = kept | where | {"_target_": f"{cls.__module__}.{cls.__qualname__}"}
+        state = kept | {"start": start, "first_share": 0.0, "_target_": f"{cls.__module__}.{cls.__qualname__}"}
         cfg.reset = {**(cfg.reset or {}), "state": state}
         known = termination_names(cfg)
         if unknown := [name for name in terminations or () if name not in known]:

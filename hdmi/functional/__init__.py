@@ -3,13 +3,16 @@
 from hdmi.functional.pose import body_velocity, local_pose
 from hdmi.functional.reward import (
     action_rate,
+    alive,
     feet_air_time,
     feet_impact,
     feet_slip,
     feet_stumble,
     interaction,
     limit_excess,
+    sum_of_squares,
     tracking,
+    tracking_mean,
 )
 from hdmi.functional.rotation import (
     quat_angle,
@@ -22,10 +25,12 @@ from hdmi.functional.rotation import (
     quat_to_rot6d,
     yaw_quat,
 )
-from hdmi.functional.termination import contact_lost, error_exceeds, persist
+from hdmi.functional.termination import any_error_exceeds, contact_lost, error_exceeds, persist
 
 __all__ = [
     "action_rate",
+    "alive",
+    "any_error_exceeds",
     "body_velocity",
     "contact_lost",
     "error_exceeds",
@@ -45,6 +50,8 @@ __all__ = [
     "quat_from_euler",
     "quat_multiply",
     "quat_to_rot6d",
+    "sum_of_squares",
     "tracking",
+    "tracking_mean",
     "yaw_quat",
 ]

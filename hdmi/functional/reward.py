@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -20,6 +21,19 @@ def tracking(error: Tensor, *, sigma: float, tolerance: float = 0.0) -> Tensor:
         Reward in (0, 1]. [..., 1]
     """
     return torch.exp(-(error.mean(-1, keepdim=True) - tolerance).clamp(min=0) / sigma)
+
+
+def tracking_mean(*errors: Tensor, sigmas: Sequence[float], tolerances: Sequence[float]) -> Tensor:
+    """Mean of the tracking kernels of several errors, each with its own sigma and tolerance.
+
+    Args:
+        errors: non-negative errors. [..., K] each, K of its own
+
+    Returns:
+        Reward in (0, 1]. [..., 1]
+    """
+    kernels = [tracking(e, sigma=s, tolerance=t) for e, s, t in zip(errors, sigmas, tolerances, strict=True)]
+    return torch.stack(kernels).mean(0)
 
 
 def interaction(
@@ -58,6 +72,16 @@ def interaction(
     if reduce == "max":
         return reward.amax(-1, keepdim=True)
     return reward.sum(-1, keepdim=True) / intended.sum(-1, keepdim=True).clamp(min=1)
+
+
+def alive(terminated: Tensor) -> Tensor:
+    """One in every step that does not terminate. bool [..., 1] -> [..., 1]"""
+    return (~terminated).float()
+
+
+def sum_of_squares(value: Tensor) -> Tensor:
+    """[..., J] -> [..., 1]"""
+    return value.square().sum(-1, keepdim=True)
 
 
 def action_rate(action: Tensor, previous: Tensor) -> Tensor:

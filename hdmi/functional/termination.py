@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 
 def error_exceeds(error: Tensor, threshold: float) -> Tensor:
     """Whether any of the errors is above the threshold. [..., K] -> bool [..., 1]"""
     return (error > threshold).any(-1, keepdim=True)
+
+
+def any_error_exceeds(*errors: Tensor, thresholds: Sequence[float]) -> Tensor:
+    """Whether any of several errors is above its threshold. [..., K] each -> bool [..., 1]"""
+    exceeded = [error_exceeds(error, threshold) for error, threshold in zip(errors, thresholds, strict=True)]
+    return torch.stack(exceeded).any(0)
 
 
 def contact_lost(

@@ -13,15 +13,11 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import torch
-from tensordict import NestedKey
 from torch import Tensor
 
 from hdmi.assets import Scene
 from hdmi.motion.playback import reference_qpos
 from hdmi.motion.reference import Reference
-
-FRAME_KEY: NestedKey = ("init", "frame")  # where an episode starts, int64 [N, 1]
-NOISE_SHARE_KEY: NestedKey = ("init", "noise_share")  # factor of a start's perturbations, [N, 1]
 
 NEAR = 0.02  # m; what is closer touches
 REACH = 0.1  # m; what the robot is closer to, it keeps its distance from, the less the farther it is

@@ -46,12 +46,19 @@ from hdmi.transforms.reward import (
     JointPosLimitsL1,
     JointTorqueLimitsL1,
     JointVelL2,
+    KernelReward,
     RewardRate,
     RewardTerm,
     SurvivalReward,
     TrackingReward,
 )
-from hdmi.transforms.termination import BodyHeight, ErrorTermination, LostContact, TerminationTerm
+from hdmi.transforms.termination import (
+    BodyHeight,
+    ErrorTermination,
+    KernelTermination,
+    LostContact,
+    TerminationTerm,
+)
 from hdmi.transforms.tracking import (
     AbsoluteDifference,
     Angle,
@@ -99,6 +106,8 @@ __all__ = [
     "JointPositionAction",
     "JointTorqueLimitsL1",
     "JointVelL2",
+    "KernelReward",
+    "KernelTermination",
     "LostContact",
     "MassRandomization",
     "Metrics",

@@ -12,18 +12,30 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import Transform
 
-from hdmi.assets import default_joint_pos, g1, match_names
-from hdmi.transforms.common import SpecTransform, StateTransform, add_state_specs
+from hdmi.names import match_names
+from hdmi.transforms.common import SpecTransform, StateTransform, add_state_specs, below, key_of
+
+
+def width_of_action(transform: Transform, action_key: NestedKey) -> int:
+    """Width of the action of the environment that a transform stands on.
+
+    Raises:
+        ValueError: if it stands on none.
+    """
+    if transform.parent is None:
+        raise ValueError(f"{type(transform).__name__}: give `size`, the width of the action, outside of an environment")
+    return int(transform.parent.full_action_spec[action_key].shape[-1])
 
 
 class _ActionTransform(SpecTransform):
     """Rewrites the action on its way to the environment with what the tensordict holds."""
 
     def __init__(self, action_key: NestedKey = "action", state_keys: Sequence[NestedKey] = ()):
-        super().__init__(in_keys_inv=[action_key], out_keys_inv=[action_key])
-        self.action_key = action_key
-        self.state_keys = list(state_keys)
+        self.action_key = key_of(action_key)
+        super().__init__(in_keys_inv=[self.action_key], out_keys_inv=[self.action_key])
+        self.state_keys = [key_of(key) for key in state_keys]
 
     def inverse(self, action: Tensor, *state: Tensor) -> Tensor:
         raise NotImplementedError
@@ -54,17 +66,19 @@ class JointPositionAction(_ActionTransform):
     """Scales the policy's action for each actuated joint and spreads it over all joints (zero elsewhere).
 
     Action: [..., A] for the A joints with a scale -> offsets [..., J], rad. The policy's own action stays in the
-    stepped tensordict as `policy_action`.
+    stepped tensordict at `policy_action_key`. TorchRL's ActionScaling scales what it is given; it does not spread it.
 
     Args:
         scale: joint name pattern -> rad per unit of action; joints that match none are not actuated by the policy.
+        joint_names: of the J joints.
     """
 
     def __init__(
         self,
         scale: Mapping[str, float],
-        joint_names: Sequence[str] = g1.JOINT_NAMES,
+        joint_names: Sequence[str],
         action_key: NestedKey = "action",
+        policy_action_key: NestedKey = "policy_action",
     ):
         super().__init__(action_key)
         table = torch.zeros(len(joint_names))
@@ -74,6 +88,7 @@ class JointPositionAction(_ActionTransform):
         self.register_buffer("index", index, persistent=False)
         self.register_buffer("scale", table[index], persistent=False)
         self.num_joints = len(joint_names)
+        self.policy_action_key = key_of(policy_action_key)
 
     def inverse(self, action: Tensor, *state: Tensor) -> Tensor:
         offsets = action.new_zeros(*action.shape[:-1], self.num_joints)
@@ -83,7 +98,7 @@ class JointPositionAction(_ActionTransform):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get(self.action_key, None)
         if action is not None:
-            tensordict.set("policy_action", action)
+            tensordict.set(self.policy_action_key, action)
         return super()._inv_call(tensordict)
 
     def transform_action_spec(self, action_spec: TensorSpec) -> TensorSpec:
@@ -113,108 +128,136 @@ class ResidualAction(_ActionTransform):
 class DefaultPoseAction(_ActionTransform):
     """Action space of the paper's ablation: target = theta_default + a.
 
+    TorchRL's ActionScaling with this loc and a scale of one does the same to the action; it bounds the specs by it.
+
     Args:
-        default_pos: joint angles, rad; the robot's standing pose by default. [J]
+        default_pos: joint angles, rad, such as the robot's standing pose. [J]
     """
 
-    def __init__(self, default_pos: Sequence[float] | None = None, action_key: NestedKey = "action"):
+    def __init__(self, default_pos: Sequence[float], action_key: NestedKey = "action"):
         super().__init__(action_key)
-        values = default_joint_pos() if default_pos is None else default_pos
-        self.register_buffer("default_pos", torch.as_tensor(values, dtype=torch.float32), persistent=False)
+        self.register_buffer("default_pos", torch.as_tensor(default_pos, dtype=torch.float32), persistent=False)
 
     def inverse(self, action: Tensor, *state: Tensor) -> Tensor:
         return self.default_pos + action
 
 
-class _ActionStateTransform(_ActionTransform, StateTransform):
-    """An action transform with state of its own in the tensordict."""
+class ActionStateTransform(_ActionTransform, StateTransform):
+    """Base of action transforms with state of their own in the tensordict.
+
+    Args:
+        size: width of the action; None asks the environment below, once.
+    """
+
+    def __init__(self, action_key: NestedKey = "action", size: int | None = None):
+        super().__init__(action_key)
+        self._size = size
+
+    @property
+    def size(self) -> int:
+        """Width of the action."""
+        if self._size is None:
+            self._size = width_of_action(self, self.action_key)
+        return self._size
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         return StateTransform.transform_input_spec(self, input_spec)
 
 
-class ActionSmoothing(_ActionStateTransform):
+class ActionSmoothing(ActionStateTransform):
     """Low-pass filter of the targets: x_t = alpha u_t + (1 - alpha) x_{t-1}, alpha drawn per episode.
 
-    Reads and writes `smoothing/{previous, alpha, fresh}`; the first step of an episode is not filtered.
+    Reads and writes `{previous, alpha, fresh}` under `state_key`; the first step of an episode is not filtered.
 
     Args:
         alpha: range of the filter coefficient.
-        size: width of the action, J.
+        size: width of the action; None asks the environment.
+        state_key: `smoothing/<action_key>` if absent.
     """
 
     def __init__(
-        self, alpha: Sequence[float] = (0.8, 1.0), size: int = len(g1.JOINT_NAMES), action_key: NestedKey = "action"
+        self,
+        alpha: Sequence[float] = (0.8, 1.0),
+        size: int | None = None,
+        action_key: NestedKey = "action",
+        state_key: NestedKey | None = None,
     ):
-        super().__init__(action_key)
+        super().__init__(action_key, size)
+        key = below("smoothing", self.action_key) if state_key is None else state_key
+        self._previous, self._alpha, self._fresh = (below(key, name) for name in ("previous", "alpha", "fresh"))
+        self._smoothed = below(key, "smoothed")  # from the way in to the end of the same step
         low, high = alpha
         if not 0 < low <= high <= 1:
             raise ValueError(f"action.smoothing.alpha: expected 0 < low <= high <= 1, got {list(alpha)}")
-        self.low, self.high, self.size = float(low), float(high), size
+        self.low, self.high = float(low), float(high)
 
     def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
         alpha = self.low + (self.high - self.low) * torch.rand(*batch_size, 1, device=device)
         return {
-            ("smoothing", "previous"): torch.zeros(*batch_size, self.size, device=device),
-            ("smoothing", "alpha"): alpha,
-            ("smoothing", "fresh"): torch.ones(*batch_size, 1, dtype=torch.bool, device=device),
+            self._previous: torch.zeros(*batch_size, self.size, device=device),
+            self._alpha: alpha,
+            self._fresh: torch.ones(*batch_size, 1, dtype=torch.bool, device=device),
         }
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get(self.action_key, None)
         if action is not None:
-            previous, alpha, fresh = (tensordict.get(("smoothing", k)) for k in ("previous", "alpha", "fresh"))
+            previous, alpha, fresh = (tensordict.get(key) for key in (self._previous, self._alpha, self._fresh))
             smoothed = torch.where(fresh, action, alpha * action + (1 - alpha) * previous)
             tensordict.set(self.action_key, smoothed)
-            tensordict.set("smoothed_action", smoothed)
+            tensordict.set(self._smoothed, smoothed)
         return tensordict
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        next_tensordict.set(("smoothing", "previous"), tensordict.get("smoothed_action"))
-        next_tensordict.set(("smoothing", "alpha"), tensordict.get(("smoothing", "alpha")))
-        fresh = tensordict.get(("smoothing", "fresh"))
-        next_tensordict.set(("smoothing", "fresh"), torch.zeros_like(fresh))
+        next_tensordict.set(self._previous, tensordict.get(self._smoothed))
+        next_tensordict.set(self._alpha, tensordict.get(self._alpha))
+        next_tensordict.set(self._fresh, torch.zeros_like(tensordict.get(self._fresh)))
         return next_tensordict
 
 
-class ActionDelay(_ActionStateTransform):
+class ActionDelay(ActionStateTransform):
     """Delays targets by a number of physics steps, drawn per episode.
 
     The environment receives one target per physics step: [..., J] -> [..., decimation, J]. With delay d, physics
     step k of control step t uses the target of control step t - ceil((d - k) / decimation); before an episode's
-    first target arrives, that target is used. Reads and writes `delay/{history, substeps, fresh}`.
+    first target arrives, that target is used. Reads and writes `{history, substeps, fresh}` under `state_key`.
 
     Args:
         substeps: smallest and largest delay, physics steps.
         decimation: physics steps per control step.
-        size: width of the action, J.
+        size: width of the action, J; None asks the environment.
+        state_key: `delay/<action_key>` if absent.
     """
 
     def __init__(
         self,
         substeps: Sequence[int],
         decimation: int,
-        size: int = len(g1.JOINT_NAMES),
+        size: int | None = None,
         action_key: NestedKey = "action",
+        state_key: NestedKey | None = None,
     ):
-        super().__init__(action_key)
+        super().__init__(action_key, size)
         self.low, self.high = (int(s) for s in substeps)
         if not 0 <= self.low <= self.high:
             raise ValueError(f"action.delay.substeps: expected 0 <= low <= high, got {list(substeps)}")
-        self.decimation, self.size = decimation, size
+        self.decimation = decimation
+        key = below("delay", self.action_key) if state_key is None else state_key
+        self._history, self._substeps, self._fresh = (below(key, name) for name in ("history", "substeps", "fresh"))
+        self._targets = below(key, "targets")  # from the way in to the end of the same step
         self.depth = -(-self.high // decimation)  # control steps to remember
 
     def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
         return {
-            ("delay", "history"): torch.zeros(*batch_size, max(self.depth, 1), self.size, device=device),
-            ("delay", "substeps"): torch.randint(self.low, self.high + 1, (*batch_size, 1), device=device),
-            ("delay", "fresh"): torch.ones(*batch_size, 1, dtype=torch.bool, device=device),
+            self._history: torch.zeros(*batch_size, max(self.depth, 1), self.size, device=device),
+            self._substeps: torch.randint(self.low, self.high + 1, (*batch_size, 1), device=device),
+            self._fresh: torch.ones(*batch_size, 1, dtype=torch.bool, device=device),
         }
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get(self.action_key, None)
         if action is not None:
-            history, delay, fresh = (tensordict.get(("delay", k)) for k in ("history", "substeps", "fresh"))
+            history, delay, fresh = (tensordict.get(key) for key in (self._history, self._substeps, self._fresh))
             present = action.unsqueeze(-2)  # [..., 1, J]
             history = torch.where(fresh.unsqueeze(-1), present.expand_as(history), history)
             targets = torch.cat([present, history], dim=-2)  # newest first [..., 1 + depth, J]
@@ -222,16 +265,14 @@ class ActionDelay(_ActionStateTransform):
             age = (delay - substep + self.decimation - 1).clamp(min=0) // self.decimation  # [..., decimation]
             index = age.unsqueeze(-1).expand(*age.shape, action.shape[-1])
             tensordict.set(self.action_key, targets.gather(-2, index))
-            tensordict.set("delay_targets", targets)
+            tensordict.set(self._targets, targets)
         return tensordict
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        history = tensordict.get(("delay", "history"))
-        next_tensordict.set(
-            ("delay", "history"), tensordict.get("delay_targets")[..., : history.shape[-2], :].contiguous()
-        )
-        next_tensordict.set(("delay", "substeps"), tensordict.get(("delay", "substeps")))
-        next_tensordict.set(("delay", "fresh"), torch.zeros_like(tensordict.get(("delay", "fresh"))))
+        kept = tensordict.get(self._history).shape[-2]
+        next_tensordict.set(self._history, tensordict.get(self._targets)[..., :kept, :].contiguous())
+        next_tensordict.set(self._substeps, tensordict.get(self._substeps))
+        next_tensordict.set(self._fresh, torch.zeros_like(tensordict.get(self._fresh)))
         return next_tensordict
 
 
@@ -239,20 +280,28 @@ class ActionHistory(StateTransform):
     """Keeps the policy's latest actions, newest first, zeros before the episode: `out_key` [..., H, A].
 
     Reads `action_key` of the stepped tensordict.
+
+    Args:
+        steps: H.
+        size: A; None asks the environment, for the width of its `env_action_key`.
     """
 
     def __init__(
         self,
         steps: int,
-        size: int,
+        size: int | None = None,
         action_key: NestedKey = "policy_action",
         out_key: NestedKey = "action_history",
+        env_action_key: NestedKey = "action",
     ):
-        super().__init__(out_keys=[out_key])
-        self.steps, self.size, self.action_key = steps, size, action_key
+        super().__init__(out_keys=[key_of(out_key)])
+        self.steps, self._size = steps, size
+        self.action_key, self.env_action_key = key_of(action_key), key_of(env_action_key)
 
     def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
-        return {self.out_keys[0]: torch.zeros(*batch_size, self.steps, self.size, device=device)}
+        if self._size is None:
+            self._size = width_of_action(self, self.env_action_key)
+        return {self.out_keys[0]: torch.zeros(*batch_size, self.steps, self._size, device=device)}
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         history = tensordict.get(self.out_keys[0])

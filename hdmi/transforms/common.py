@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
+from inspect import signature
+from pkgutil import resolve_name
 from typing import Any
 
 import torch
@@ -39,14 +41,33 @@ def without_drawing(method: Callable[[Any, Composite], Composite]) -> Callable[[
     return wrapped
 
 
-class SpecTransform(Transform):
-    """Base that edits specs in place.
+def key_of(key: NestedKey | Sequence[str]) -> NestedKey:
+    """A nested key that may have come from a config as a list."""
+    return key if isinstance(key, str) else unravel_key(tuple(key))
 
-    TorchRL's Transform copies all specs for each transform, which makes building a stack of n transforms over m keys
-    cost n m tensors of the batch's size; the environment has copied them once already.
+
+def below(key: NestedKey | Sequence[str], *names: NestedKey) -> NestedKey:
+    """The nested key of an entry under another: `below(("a", "b"), "c") == ("a", "b", "c")`."""
+    return unravel_key((key_of(key), *names))
+
+
+def copied(spec: Composite) -> Composite:
+    """A copy whose entries may be replaced; the specs of tensors are shared, since transforms replace them whole."""
+    out = spec.empty()
+    for key, value in spec.items():
+        out[key] = copied(value) if isinstance(value, Composite) else value
+    return out
+
+
+class SpecTransform(Transform):
+    """Base whose `transform_*_spec` return copies and leave what they are given alone.
+
+    TorchRL's Transform clones all specs, tensors of the batch's size included, for each transform, so that a stack of
+    n transforms over m keys takes n m tensors to build; here only the structure is copied.
     """
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
+        output_spec = copied(output_spec)
         for name, transform in (
             ("full_observation_spec", self.transform_observation_spec),
             ("full_reward_spec", self.transform_reward_spec),
@@ -56,6 +77,7 @@ class SpecTransform(Transform):
         return output_spec
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
+        input_spec = copied(input_spec)
         input_spec["full_state_spec"] = self.transform_state_spec(input_spec["full_state_spec"])
         input_spec["full_action_spec"] = self.transform_action_spec(input_spec["full_action_spec"])
         return input_spec
@@ -65,7 +87,7 @@ class FunctionTransform(SpecTransform):
     """Writes `out_keys = function(*in_keys)` after every step and reset; specs follow from the function."""
 
     def __init__(self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]):
-        super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
+        super().__init__(in_keys=[key_of(key) for key in in_keys], out_keys=[key_of(key) for key in out_keys])
 
     def function(self, *inputs: Tensor) -> Tensor | tuple[Tensor, ...]:
         """The tensor function; one output per out_key."""
@@ -90,6 +112,7 @@ class FunctionTransform(SpecTransform):
 
     @without_drawing
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        observation_spec = copied(observation_spec)
         inputs = TensorDict({}, batch_size=observation_spec.shape, device=observation_spec.device)
         for key in self.in_keys:
             if unravel_key(key) not in observation_spec.keys(True, True):
@@ -120,8 +143,9 @@ class StateTransform(SpecTransform):
 
     @without_drawing
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        observation_spec = copied(observation_spec)
         for key, value in self.initial_state(observation_spec.shape, observation_spec.device).items():
-            observation_spec[unravel_key(key)] = spec_like(value)
+            add_state(observation_spec, key, value, self)
         return observation_spec
 
     @without_drawing
@@ -136,8 +160,22 @@ class StateTransform(SpecTransform):
         )
 
 
+def add_state(observation_spec: Composite, key: NestedKey, value: Tensor, owner: Transform) -> None:
+    """Adds the spec of an entry in which a transform keeps state.
+
+    Raises:
+        ValueError: if something before it writes an entry of that key: each needs one of its own.
+    """
+    if unravel_key(key) in observation_spec.keys(True, True):
+        raise ValueError(
+            f"{type(owner).__name__}: its state would be kept at {key!r}, which something before it writes already; "
+            "give it another key"
+        )
+    observation_spec[unravel_key(key)] = spec_like(value)
+
+
 def add_state_specs(input_spec: Composite, specs: Mapping[NestedKey, TensorSpec]) -> Composite:
-    """Declares keys that a step reads from the tensordict besides the action."""
+    """Declares keys that a step reads from the tensordict besides the action, in place."""
     if input_spec["full_state_spec"] is None:
         input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
     for key, spec in specs.items():
@@ -152,8 +190,53 @@ def soft_limits(limits: Sequence[Sequence[float]], share: float) -> tuple[Tensor
     return middle - half, middle + half
 
 
-def set_terminated(next_tensordict: TensorDictBase, flag: Tensor, key: str = "terminated") -> None:
+def raise_done(next_tensordict: TensorDictBase, flag: Tensor, key: NestedKey, done_key: NestedKey) -> None:
     """Raises `terminated` (or `truncated`) where `flag`, and `done` with it: `any_done` reads only `done`."""
     present = next_tensordict.get(key, None)
     next_tensordict.set(key, flag if present is None else present | flag)
-    next_tensordict.set("done", next_tensordict.get("done") | flag)
+    next_tensordict.set(done_key, next_tensordict.get(done_key) | flag)
+
+
+class BoundKernel(torch.nn.Module):
+    """A tensor function with its parameters; tensors among them move with the module.
+
+    Args:
+        function: itself, or its dotted name.
+        num_inputs: tensors that it will be called with.
+        where: for messages.
+        parameters: keyword arguments; tensors stay tensors, everything else stays what it is.
+
+    Raises:
+        ValueError: if there is no such function, or it does not take such a call.
+    """
+
+    def __init__(
+        self, function: Callable[..., Tensor] | str, num_inputs: int, where: str, parameters: Mapping[str, Any]
+    ):
+        super().__init__()
+        if isinstance(function, str):
+            try:
+                function = resolve_name(function)
+            except (ImportError, AttributeError, ValueError) as error:
+                raise ValueError(f"{where}: there is no function {function!r}: {error}") from error
+        if not callable(function):
+            raise ValueError(f"{where}: {function!r} is no function")
+        self.function, self.name = function, getattr(function, "__name__", type(function).__name__)
+        try:
+            taken = signature(function)
+        except ValueError:  # of a function in C, which does not say what it takes
+            taken = None
+        try:
+            if taken is not None:
+                taken.bind(*[None] * num_inputs, **parameters)
+        except TypeError as error:
+            raise ValueError(
+                f"{where}: {self.name}{taken} does not take {num_inputs} keys and {sorted(parameters)}: {error}"
+            ) from error
+        self._tensors = [name for name, value in parameters.items() if isinstance(value, Tensor)]
+        self._numbers = {name: value for name, value in parameters.items() if name not in self._tensors}
+        for name in self._tensors:
+            self.register_buffer(name, parameters[name], persistent=False)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return self.function(*inputs, **self._numbers, **{name: getattr(self, name) for name in self._tensors})

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
-from hdmi.assets import default_joint_pos
 from hdmi.functional import (
     quat_apply,
     quat_apply_inverse,
@@ -18,7 +17,17 @@ from hdmi.functional import (
     quat_multiply,
     quat_to_rot6d,
 )
-from hdmi.transforms.common import FunctionTransform, SpecTransform, add_state_specs, spec_like, without_drawing
+from hdmi.transforms.common import (
+    FunctionTransform,
+    SpecTransform,
+    add_state,
+    add_state_specs,
+    below,
+    copied,
+    key_of,
+    spec_like,
+    without_drawing,
+)
 
 _ROOT_POS: NestedKey = ("robot", "root_pos")
 _ROOT_QUAT: NestedKey = ("robot", "root_quat")
@@ -91,24 +100,26 @@ class ProjectedGravity(FunctionTransform):
 
 
 class RelativeJointPos(FunctionTransform):
-    """Joint positions relative to the default pose, rad. [N, J] -> [N, J]"""
+    """Joint positions relative to the default pose, rad. [N, J] -> [N, J]
 
-    def __init__(
-        self,
-        out_key: NestedKey,
-        in_key: NestedKey = ("robot", "joint_pos"),
-        default_pos: Sequence[float] | None = None,
-    ):
+    Args:
+        default_pos: joint angles, rad. [J]
+    """
+
+    def __init__(self, out_key: NestedKey, default_pos: Sequence[float], in_key: NestedKey = ("robot", "joint_pos")):
         super().__init__([in_key], [out_key])
-        values = default_joint_pos() if default_pos is None else default_pos
-        self.register_buffer("default_pos", torch.as_tensor(values, dtype=torch.float32), persistent=False)
+        self.register_buffer("default_pos", torch.as_tensor(default_pos, dtype=torch.float32), persistent=False)
 
     def function(self, *inputs: Tensor) -> Tensor:
         return inputs[0] - self.default_pos
 
 
 class Flatten(FunctionTransform):
-    """An entry as one feature vector per world, float32. [N, ...] -> [N, D]"""
+    """An entry as one feature vector per world, float32. [N, ...] -> [N, D]
+
+    TorchRL's FlattenObservation flattens between two dimensions that are given; how many there are differs here, and
+    flags become numbers.
+    """
 
     def __init__(self, in_key: NestedKey, out_key: NestedKey):
         super().__init__([in_key], [out_key])
@@ -157,8 +168,8 @@ class _EntryState(SpecTransform):
     """Base of transforms that rewrite an entry with state of their own, whose shape follows from the entry."""
 
     def __init__(self, key: NestedKey, state_key: NestedKey):
-        super().__init__(in_keys=[key], out_keys=[key])
-        self.state_key = state_key
+        super().__init__(in_keys=[key_of(key)], out_keys=[key_of(key)])
+        self.state_key = key_of(state_key)
         self._features: torch.Size | None = None  # of the entry, once specs have been asked for
 
     def fresh_state(self, value: Tensor) -> Tensor:
@@ -184,11 +195,12 @@ class _EntryState(SpecTransform):
 
     @without_drawing
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        observation_spec = copied(observation_spec)
         value = observation_spec[self.in_keys[0]].zero()
         self._features = value.shape[len(observation_spec.shape) :]
         value, state = self.update(value, self.fresh_state(value))
         observation_spec[self.in_keys[0]] = spec_like(value)
-        observation_spec[self.state_key] = spec_like(state)
+        add_state(observation_spec, self.state_key, state, self)
         return observation_spec
 
     @without_drawing
@@ -211,14 +223,15 @@ class _EntryState(SpecTransform):
 class EpisodeNoise(_EntryState):
     """Adds a uniform offset that is drawn once per episode to an entry, in place of it.
 
-    State: `episode_noise/<last part of the key>` [N, D].
+    State: the offset, [N, D].
 
     Args:
         scale: half range.
+        state_key: `episode_noise/<key>` if absent.
     """
 
-    def __init__(self, key: NestedKey, scale: float):
-        super().__init__(key, ("episode_noise", unravel_key(key)[-1] if not isinstance(key, str) else key))
+    def __init__(self, key: NestedKey, scale: float, state_key: NestedKey | None = None):
+        super().__init__(key, below("episode_noise", key_of(key)) if state_key is None else state_key)
         self.scale = scale
 
     def fresh_state(self, value: Tensor) -> Tensor:
@@ -250,15 +263,16 @@ class HeadingNoise(FunctionTransform):
 class History(_EntryState):
     """Stacks an observation with its past, newest first, in place of it: [N, D] -> [N, (1 + steps) D].
 
-    At the start of an episode the first observation fills the past. State: `history/<last part of the key>`
-    [N, steps, D].
+    At the start of an episode the first observation fills the past. State: the past, [N, steps, D]; TorchRL's CatFrames
+    keeps it in the module, where a reset of some rows, a worker or a checkpoint does not find it.
 
     Args:
         steps: past observations to keep.
+        state_key: `history/<key>` if absent.
     """
 
-    def __init__(self, key: NestedKey, steps: int):
-        super().__init__(key, ("history", unravel_key(key)[-1] if not isinstance(key, str) else key))
+    def __init__(self, key: NestedKey, steps: int, state_key: NestedKey | None = None):
+        super().__init__(key, below("history", key_of(key)) if state_key is None else state_key)
         if steps < 1:
             raise ValueError(f"history of {key}: steps must be at least 1, got {steps}")
         self.steps = steps

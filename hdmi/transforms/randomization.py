@@ -7,17 +7,20 @@ before them wrote; `HumanoidObjectEnv` applies the rows of the worlds that reset
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import mujoco
-import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
-from hdmi.assets import g1, match_names
-from hdmi.transforms.action import _ActionStateTransform
-from hdmi.transforms.common import SpecTransform
+from hdmi.names import match_names
+from hdmi.transforms.action import ActionStateTransform
+from hdmi.transforms.common import SpecTransform, StateTransform, below, key_of
+
+if TYPE_CHECKING:
+    import mujoco
+
+_MESH = 7  # mjGEOM_MESH
 
 
 def _between(span: Sequence[float], shape: Sequence[int], device: torch.device | None) -> Tensor:
@@ -32,6 +35,8 @@ class ModelRandomization(SpecTransform):
     Args:
         per: `episode` draws at every reset; `world` once, at the first reset, so that worlds differ but stay.
         model: whose `fields` are the nominal ones.
+        init_key: under which what the environment resets to is written, fields of the model under `model` there.
+        worlds_key: numbers of the worlds that reset, int64 [n], where only rows do.
     """
 
     def __init__(
@@ -39,8 +44,11 @@ class ModelRandomization(SpecTransform):
         per: Literal["episode", "world"] = "episode",
         model: mujoco.MjModel | None = None,
         fields: Sequence[str] = (),
+        init_key: NestedKey = "init",
+        worlds_key: NestedKey = "worlds",
     ):
         super().__init__()
+        self.init_key, self.worlds_key = key_of(init_key), key_of(worlds_key)
         if per not in ("episode", "world"):
             raise ValueError(f"{type(self).__name__}: per is 'episode' or 'world', got {per!r}")
         self.per = per
@@ -48,7 +56,7 @@ class ModelRandomization(SpecTransform):
         self.register_buffer("seed", torch.tensor(-1))
         self._world_rows: dict[NestedKey, Tensor] = {}  # what the seed gives on top of the nominal model
         for field in fields:
-            values = torch.from_numpy(np.array(getattr(model, field), dtype=np.float32))
+            values = torch.tensor(getattr(model, field), dtype=torch.float32)
             self.register_buffer(f"nominal_{field}", values, persistent=False)
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
@@ -70,14 +78,14 @@ class ModelRandomization(SpecTransform):
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         if tensordict is None:
             tensordict = TensorDict({}, batch_size=self.parent.batch_size, device=self.parent.device)
-        init = tensordict.get("init", None)
+        init = tensordict.get(self.init_key, None)
         if init is None:
             init = TensorDict({}, batch_size=tensordict.batch_size, device=tensordict.device)
         if self.per == "world":
-            self._draw_again(init, tensordict.get("worlds", None))
+            self._draw_again(init, tensordict.get(self.worlds_key, None))
         else:
             self.draw(init)
-        tensordict.set("init", init)
+        tensordict.set(self.init_key, init)
         return tensordict
 
     def _draw_again(self, init: TensorDictBase, worlds: Tensor | None) -> None:
@@ -139,8 +147,10 @@ class MassRandomization(ModelRandomization):
         per: Literal["episode", "world"] = "episode",
         among: Literal["scene", "robot"] = "scene",
         robot_bodies: Sequence[int] = (),
+        init_key: NestedKey = "init",
+        worlds_key: NestedKey = "worlds",
     ):
-        super().__init__(per, model, ("body_mass", "body_inertia"))
+        super().__init__(per, model, ("body_mass", "body_inertia"), init_key, worlds_key)
         if (scale is None) == (mass is None):
             raise ValueError("MassRandomization: give either scale or mass")
         index = _find_bodies(model, bodies, among, robot_bodies, "MassRandomization")
@@ -174,8 +184,10 @@ class CenterOfMassRandomization(ModelRandomization):
         per: Literal["episode", "world"] = "episode",
         among: Literal["scene", "robot"] = "scene",
         robot_bodies: Sequence[int] = (),
+        init_key: NestedKey = "init",
+        worlds_key: NestedKey = "worlds",
     ):
-        super().__init__(per, model, ("body_ipos",))
+        super().__init__(per, model, ("body_ipos",), init_key, worlds_key)
         index = _find_bodies(model, bodies, among, robot_bodies, "CenterOfMassRandomization")
         self.register_buffer("bodies", torch.as_tensor(index), persistent=False)
         self.shift = shift
@@ -202,8 +214,10 @@ class FrictionRandomization(ModelRandomization):
         per: Literal["episode", "world"] = "episode",
         among: Literal["scene", "robot"] = "scene",
         robot_bodies: Sequence[int] = (),
+        init_key: NestedKey = "init",
+        worlds_key: NestedKey = "worlds",
     ):
-        super().__init__(per, model, ("geom_friction",))
+        super().__init__(per, model, ("geom_friction",), init_key, worlds_key)
         wanted = _find_bodies(model, bodies, among, robot_bodies, "FrictionRandomization")
         geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in wanted]
         self.register_buffer("geoms", torch.as_tensor(geoms), persistent=False)
@@ -216,7 +230,11 @@ class FrictionRandomization(ModelRandomization):
 
 
 class ObjectScale(ModelRandomization):
-    """Scales the object about its body's origin: geoms, hinge and contact points. Writes `init/object_scale`.
+    """Scales the object about its body's origin: geoms, hinge and contact points. Writes `init/object_scale` [N, 1].
+
+    Args:
+        scale: range. object_geoms: of the model.
+        entry: name of what is drawn, under `init_key`.
 
     Raises:
         ValueError: for an object with meshes, which MuJoCo cannot scale per world.
@@ -228,14 +246,18 @@ class ObjectScale(ModelRandomization):
         per: Literal["episode", "world"] = "episode",
         model: mujoco.MjModel | None = None,
         object_geoms: Sequence[int] = (),
+        init_key: NestedKey = "init",
+        entry: str = "object_scale",
+        worlds_key: NestedKey = "worlds",
     ):
-        super().__init__(per)
-        if model is not None and (model.geom_type[object_geoms] == mujoco.mjtGeom.mjGEOM_MESH).any():
+        super().__init__(per, init_key=init_key, worlds_key=worlds_key)
+        self.entry = entry
+        if model is not None and any(model.geom(g).type[0] == _MESH for g in object_geoms):
             raise ValueError("a mesh cannot be scaled per world: leave this node out (randomization.object_scale=null)")
         self.range = scale
 
     def draw(self, init: TensorDictBase) -> None:
-        init.set("object_scale", _between(self.range, (init.batch_size[0], 1), init.device))
+        init.set(self.entry, _between(self.range, (init.batch_size[0], 1), init.device))
 
 
 class ObjectJointRandomization(ModelRandomization):
@@ -248,8 +270,10 @@ class ObjectJointRandomization(ModelRandomization):
         friction: Sequence[float],
         damping: Sequence[float],
         per: Literal["episode", "world"] = "episode",
+        init_key: NestedKey = "init",
+        worlds_key: NestedKey = "worlds",
     ):
-        super().__init__(per, model, ("dof_frictionloss", "dof_damping"))
+        super().__init__(per, model, ("dof_frictionloss", "dof_damping"), init_key, worlds_key)
         names = [model.joint(i).name for i in range(model.njnt)]
         self.dof = int(model.jnt_dofadr[match_names([joint], names, "ObjectJointRandomization.joint")[0]])
         self.ranges = {"dof_frictionloss": friction, "dof_damping": damping}
@@ -261,48 +285,67 @@ class ObjectJointRandomization(ModelRandomization):
             init.set(("model", field), rows)
 
 
-class JointOffset(_ActionStateTransform):
+class JointOffset(ActionStateTransform):
     """Calibration error of the joints: a constant offset on every target, drawn per episode.
 
-    State: `joint_offset` [N, J], rad.
+    State: the offset, [N, J], rad.
 
     Args:
         offset: half range, rad.
+        size: width of the action, J; None asks the environment.
+        state_key: `joint_offset/<action_key>` if absent.
     """
 
-    def __init__(self, offset: float, size: int = len(g1.JOINT_NAMES), action_key: NestedKey = "action"):
-        super().__init__(action_key)
-        self.offset, self.size = offset, size
+    def __init__(
+        self,
+        offset: float,
+        size: int | None = None,
+        action_key: NestedKey = "action",
+        state_key: NestedKey | None = None,
+    ):
+        super().__init__(action_key, size)
+        self.offset = offset
+        self.state_key = below("joint_offset", self.action_key) if state_key is None else key_of(state_key)
 
     def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
-        return {"joint_offset": _between((-self.offset, self.offset), (*batch_size, self.size), device)}
+        return {self.state_key: _between((-self.offset, self.offset), (*batch_size, self.size), device)}
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get(self.action_key, None)
         if action is not None:
-            offset = tensordict.get("joint_offset")
+            offset = tensordict.get(self.state_key)
             # targets may come one per physics step [N, S, J]
             tensordict.set(self.action_key, action + (offset if action.ndim == offset.ndim else offset.unsqueeze(-2)))
         return tensordict
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        next_tensordict.set("joint_offset", tensordict.get("joint_offset"))
+        next_tensordict.set(self.state_key, tensordict.get(self.state_key))
         return next_tensordict
 
 
-class RandomPush(_ActionStateTransform):
+class RandomPush(StateTransform):
     """Pushes the robot: now and then adds a random velocity to its root.
 
-    Writes `push` [N, 6] into the stepped tensordict, which `HumanoidObjectEnv` adds to the root's linear and
-    angular world velocity before stepping. State: `push_countdown` int64 [N, 1].
+    Writes `out_key` [N, 6] into the stepped tensordict, which `HumanoidObjectEnv` adds to the root's linear and
+    angular world velocity before stepping. State: control steps to the next one, int64 [N, 1].
 
     Args:
         interval: range of control steps between pushes.
         linear, angular: half ranges of the added velocity, m/s and rad/s.
+        state_key: `push_countdown/<out_key>` if absent.
     """
 
-    def __init__(self, interval: Sequence[int], linear: Sequence[float], angular: Sequence[float]):
+    def __init__(
+        self,
+        interval: Sequence[int],
+        linear: Sequence[float],
+        angular: Sequence[float],
+        out_key: NestedKey = "push",
+        state_key: NestedKey | None = None,
+    ):
         super().__init__()
+        self.out_key = key_of(out_key)
+        self.state_key = below("push_countdown", self.out_key) if state_key is None else key_of(state_key)
         self.low, self.high = (int(i) for i in interval)
         if not 1 <= self.low <= self.high:
             raise ValueError(f"push.interval: expected 1 <= low <= high, got {list(interval)}")
@@ -313,18 +356,18 @@ class RandomPush(_ActionStateTransform):
         return torch.randint(self.low, self.high + 1, (*batch_size, 1), device=device)
 
     def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
-        return {"push_countdown": self._countdown(batch_size, device)}
+        return {self.state_key: self._countdown(batch_size, device)}
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        countdown = tensordict.get("push_countdown", None)
+        countdown = tensordict.get(self.state_key, None)
         if countdown is not None:
             size = (*countdown.shape[:-1], len(self.half_range))
             velocity = (2 * torch.rand(size, device=countdown.device) - 1) * self.half_range
-            tensordict.set("push", velocity * (countdown <= 1))
+            tensordict.set(self.out_key, velocity * (countdown <= 1))
         return tensordict
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        countdown = tensordict.get("push_countdown")
+        countdown = tensordict.get(self.state_key)
         fresh = self._countdown(countdown.shape[:-1], countdown.device)
-        next_tensordict.set("push_countdown", torch.where(countdown <= 1, fresh, countdown - 1))
+        next_tensordict.set(self.state_key, torch.where(countdown <= 1, fresh, countdown - 1))
         return next_tensordict

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
-from hdmi.assets import g1, match_names
 from hdmi.functional import local_pose, quat_from_euler, quat_multiply
-from hdmi.motion import Reference
-from hdmi.motion.starts import FRAME_KEY, NOISE_SHARE_KEY, StartTables
+from hdmi.names import FRAME_KEY, NOISE_SHARE_KEY, match_names
 from hdmi.transforms.common import (
     SpecTransform,
     StateTransform,
     add_state_specs,
-    set_terminated,
+    below,
+    copied,
+    key_of,
+    raise_done,
     soft_limits,
     spec_like,
 )
+
+if TYPE_CHECKING:
+    from hdmi.motion import Reference
+    from hdmi.motion.starts import StartTables
 
 
 def _uniform(shape: Sequence[int], half_range: Tensor | float, device: torch.device | None) -> Tensor:
@@ -35,8 +40,8 @@ class MotionReference(StateTransform):
     each step moves on by one. Past the end the last frame stays.
 
     Reads on reset `init/frame` int64 [N, 1] if something wrote it (else frame 0).
-    Writes under `ref` (N worlds, K tracked bodies, J tracked joints, E effectors, F future steps):
-        `step` int64 [N, 1]; `phase` [N, 1] in [0, 1]; `joint_pos`, `joint_vel` [N, 29];
+    Writes under `out_key` (N worlds, K tracked bodies, J tracked joints of all, E effectors, F future steps):
+        `step` int64 [N, 1]; `phase` [N, 1] in [0, 1]; `joint_pos`, `joint_vel` [N, all];
         `root_pos` [N, 3], `root_quat` [N, 4]; `body_pos`, `body_lin_vel`, `body_ang_vel` [N, K, 3],
         `body_quat` [N, K, 4]; `body_pos_local`, `body_quat_local` (see `functional.local_pose`);
         `future/joint_pos` [N, F, J], `future/body_pos_local` [N, F, K, 3] (future bodies in the present reference
@@ -45,8 +50,9 @@ class MotionReference(StateTransform):
 
     Args:
         reference: what to track.
-        tracked_bodies, tracked_joints: name patterns.
+        tracked_bodies, tracked_joints: name patterns. body_names, joint_names: those of the robot.
         future_steps: control steps ahead.
+        out_key: under which the reference goes; `step` there is its state.
     """
 
     def __init__(
@@ -54,12 +60,19 @@ class MotionReference(StateTransform):
         reference: Reference,
         tracked_bodies: Sequence[str],
         tracked_joints: Sequence[str],
+        body_names: Sequence[str],
+        joint_names: Sequence[str],
         future_steps: Sequence[int] = (1, 2, 8, 16, 32),
+        out_key: NestedKey = "ref",
+        frame_key: NestedKey = FRAME_KEY,
     ):
-        joints = match_names(tracked_joints, g1.JOINT_NAMES, "tracked_joints")
-        bodies = match_names(tracked_bodies, g1.BODY_NAMES, "tracked_bodies")
-        table = _reference_table(reference, bodies, joints, future_steps)
-        super().__init__(in_keys=[], out_keys=[("ref", "step"), *table])
+        joints = match_names(tracked_joints, joint_names, "tracked_joints")
+        bodies = match_names(tracked_bodies, body_names, "tracked_bodies")
+        tables = _reference_table(reference, bodies, joints, future_steps)
+        table = {below(out_key, key): value for key, value in tables.items()}
+        self._step_key, self._base_key = below(out_key, "step"), below(out_key, "joint_pos")
+        super().__init__(in_keys=[], out_keys=[self._step_key, *table])
+        self.frame_key = key_of(frame_key)
         self.num_frames = reference.num_frames
         self._shapes = {key: value.shape[1:] for key, value in table.items()}
         self._dtypes = {key: value.dtype for key, value in table.items()}
@@ -70,7 +83,7 @@ class MotionReference(StateTransform):
     def _lookup(self, step: Tensor) -> dict[NestedKey, Tensor]:
         rows = self.table[step.reshape(-1)].reshape(*step.shape[:-1], -1)
         sizes = [shape.numel() for shape in self._shapes.values()]
-        out: dict[NestedKey, Tensor] = {("ref", "step"): step}
+        out: dict[NestedKey, Tensor] = {self._step_key: step}
         for (key, shape), value in zip(self._shapes.items(), rows.split(sizes, dim=-1), strict=True):
             out[key] = value.unflatten(-1, shape).to(self._dtypes[key])
         return out
@@ -79,11 +92,10 @@ class MotionReference(StateTransform):
         return self._lookup(torch.zeros(*batch_size, 1, dtype=torch.int64, device=device))
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
+        input_spec = copied(input_spec)
         # only the clock is read back by this transform, and the joint positions by residual actions
         state = self.initial_state(input_spec.shape, input_spec.device)
-        return add_state_specs(
-            input_spec, {key: spec_like(state[key]) for key in (("ref", "step"), ("ref", "joint_pos"))}
-        )
+        return add_state_specs(input_spec, {key: spec_like(state[key]) for key in (self._step_key, self._base_key)})
 
     def _write(self, tensordict: TensorDictBase, step: Tensor) -> TensorDictBase:
         for key, value in self._lookup(step).items():
@@ -91,13 +103,13 @@ class MotionReference(StateTransform):
         return tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        step = tensordict.get(FRAME_KEY, None)
+        step = tensordict.get(self.frame_key, None)
         if step is None:
             step = torch.zeros(*tensordict_reset.batch_size, 1, dtype=torch.int64, device=tensordict_reset.device)
         return self._write(tensordict_reset, step)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        step = (tensordict.get(("ref", "step")) + 1).clamp(max=self.num_frames - 1)
+        step = (tensordict.get(self._step_key) + 1).clamp(max=self.num_frames - 1)
         return self._write(next_tensordict, step)
 
 
@@ -109,32 +121,32 @@ def _reference_table(
     pos_local, quat_local = local_pose(r.body_pos[:, index], r.body_quat[:, index], root_pos, root_quat)
     last, frames = r.num_frames - 1, torch.arange(r.num_frames, device=root_pos.device)[:, None]
     table: dict[NestedKey, Tensor] = {
-        ("ref", "phase"): frames / last,
-        ("ref", "joint_pos"): r.joint_pos,
-        ("ref", "joint_vel"): r.joint_vel,
-        ("ref", "root_pos"): root_pos,
-        ("ref", "root_quat"): root_quat,
-        ("ref", "body_pos"): r.body_pos[:, index],
-        ("ref", "body_quat"): r.body_quat[:, index],
-        ("ref", "body_lin_vel"): r.body_lin_vel[:, index],
-        ("ref", "body_ang_vel"): r.body_ang_vel[:, index],
-        ("ref", "body_pos_local"): pos_local,
-        ("ref", "body_quat_local"): quat_local,
+        "phase": frames / last,
+        "joint_pos": r.joint_pos,
+        "joint_vel": r.joint_vel,
+        "root_pos": root_pos,
+        "root_quat": root_quat,
+        "body_pos": r.body_pos[:, index],
+        "body_quat": r.body_quat[:, index],
+        "body_lin_vel": r.body_lin_vel[:, index],
+        "body_ang_vel": r.body_ang_vel[:, index],
+        "body_pos_local": pos_local,
+        "body_quat_local": quat_local,
     }
     if r.has_object:
-        table[("ref", "object_pos")] = r.object_pos
-        table[("ref", "object_quat")] = r.object_quat
+        table["object_pos"] = r.object_pos
+        table["object_quat"] = r.object_quat
         if r.object_joint_pos.shape[-1]:
-            table[("ref", "object_joint_pos")] = r.object_joint_pos
+            table["object_joint_pos"] = r.object_joint_pos
     if r.contact.shape[-1]:
-        table[("ref", "contact")] = r.contact
-        table[("ref", "contact_point")] = r.contact_point
+        table["contact"] = r.contact
+        table["contact_point"] = r.contact_point
     if future_steps:
         ahead = (frames + torch.as_tensor(list(future_steps), device=frames.device)).clamp(max=last)  # [T, F]
-        table[("ref", "future", "joint_pos")] = r.joint_pos[ahead][..., list(joints)]
+        table[("future", "joint_pos")] = r.joint_pos[ahead][..., list(joints)]
         future_pos = r.body_pos[ahead][:, :, index].flatten(1, 2)  # [T, F K, 3]
         future_local, _ = local_pose(future_pos, future_pos.new_zeros(*future_pos.shape[:-1], 4), root_pos, root_quat)
-        table[("ref", "future", "body_pos_local")] = future_local.unflatten(1, (len(future_steps), len(index)))
+        table[("future", "body_pos_local")] = future_local.unflatten(1, (len(future_steps), len(index)))
     return table
 
 
@@ -147,18 +159,19 @@ class ReferenceStateInitialization(SpecTransform):
 
     Reads on reset, all optional: `init/object_scale` [N, 1], which transforms farther out draw; `init/frame` int64
     [N, 1], where to start instead of at a drawn frame; `init/noise_share` [N, 1], factor of all perturbations.
-    Writes, before the base environment resets: `init/frame` and the state under `init` that `HumanoidObjectEnv` reads.
-    It has no effect between resets.
+    Writes, before the base environment resets: `init/frame` and the state under `init_key` that `HumanoidObjectEnv`
+    reads. It has no effect between resets.
 
     Args:
         reference: where to start from.
-        start: `uniform` over all frames but the last `margin`, or `first`.
+        start: `uniform` over all frames but the last `margin`, `first`, or a frame.
         margin: frames at the end that no episode starts from.
         first_share: share of episodes that start at the first frame all the same, as evaluations do.
         noise: half ranges of uniform perturbations: root_pos [3] m, root_rpy [3] rad, root_lin_vel, root_ang_vel,
             joint_pos (rad), joint_vel; object_pos [3], object_rpy [3], object_joint (rad). Absent means none.
         held_noise: factor of the object's perturbations at frames where contact is intended: an object between two
             hands cannot be somewhere else.
+        joint_ranges: of the robot, rad. [J, 2]
         soft_limit: share of the joint ranges, about their middles, that starts stay in.
         starts: of the reference in its scene; without them the object's size changes nothing, and no support moves.
     """
@@ -171,22 +184,31 @@ class ReferenceStateInitialization(SpecTransform):
     def __init__(
         self,
         reference: Reference,
-        start: Literal["uniform", "first"] = "uniform",
+        joint_ranges: Sequence[Sequence[float]],
+        start: Literal["uniform", "first"] | int = "uniform",
         margin: int = 1,
         noise: Mapping[str, float | Sequence[float]] | None = None,
         held_noise: float = 1.0,
         first_share: float = 0.0,
         soft_limit: float = 0.95,
-        limits: Sequence[Sequence[float]] = g1.JOINT_RANGES,
         starts: StartTables | None = None,
+        init_key: NestedKey = "init",
+        scale_key: NestedKey = ("init", "object_scale"),
+        frame_key: NestedKey = FRAME_KEY,
+        noise_share_key: NestedKey = NOISE_SHARE_KEY,
     ):
         super().__init__()
-        if start not in ("uniform", "first"):
-            raise ValueError(f"reset.start: expected 'uniform' or 'first', got {start!r}")
+        start = 0 if start == "first" else start
+        if isinstance(start, str) and start != "uniform":
+            raise ValueError(f"reset.start: expected 'uniform', 'first' or a frame, got {start!r}")
+        if not isinstance(start, str) and not 0 <= start < reference.num_frames - 1:
+            raise ValueError(f"start: expected a frame from 0 to {reference.num_frames - 2}, got {start}")
         unknown = set(noise or {}) - set(self._NOISES)
         if unknown:
             raise ValueError(f"reset.noise: unknown {sorted(unknown)}; there is {list(self._NOISES)}")
         self.start, self.first_share = start, first_share
+        self.init_key, self.scale_key = key_of(init_key), key_of(scale_key)
+        self.frame_key, self.noise_share_key = key_of(frame_key), key_of(noise_share_key)
         self.num_starts = max(reference.num_frames - margin, 1)
         self.reference = reference
         held = reference.contact.any(-1, keepdim=True)  # [T, 1]
@@ -194,7 +216,7 @@ class ReferenceStateInitialization(SpecTransform):
         for name in self._NOISES:
             value = torch.as_tensor((noise or {}).get(name, 0.0), dtype=torch.float32)
             self.register_buffer(f"noise_{name}", value, persistent=False)
-        low, high = soft_limits(limits, soft_limit)
+        low, high = soft_limits(joint_ranges, soft_limit)
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("high", high, persistent=False)
         self.has_starts = starts is not None
@@ -204,8 +226,8 @@ class ReferenceStateInitialization(SpecTransform):
 
     def sample_frames(self, batch_size: torch.Size, device: torch.device | None) -> Tensor:
         """Start frames. int64 [*batch_size]"""
-        if self.start == "first":
-            return torch.zeros(batch_size, dtype=torch.int64, device=device)
+        if not isinstance(self.start, str):
+            return torch.full(tuple(batch_size), self.start, dtype=torch.int64, device=device)
         return torch.randint(self.num_starts, tuple(batch_size), device=device)
 
     def _start_frames(self, batch_size: torch.Size, device: torch.device | None) -> Tensor:
@@ -215,13 +237,13 @@ class ReferenceStateInitialization(SpecTransform):
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         if tensordict is None:
             tensordict = TensorDict({}, batch_size=self.parent.batch_size, device=self.parent.device)
-        frames = tensordict.get(FRAME_KEY, None)
+        frames = tensordict.get(self.frame_key, None)
         if frames is None:
             frames = self._start_frames(tensordict.batch_size, tensordict.device).unsqueeze(-1)
-            tensordict.set(FRAME_KEY, frames)
-        scale, noise_share = tensordict.get(("init", "object_scale"), None), tensordict.get(NOISE_SHARE_KEY, None)
+            tensordict.set(self.frame_key, frames)
+        scale, noise_share = tensordict.get(self.scale_key, None), tensordict.get(self.noise_share_key, None)
         for key, value in self.initial_state(frames.squeeze(-1), scale, noise_share).items():
-            tensordict.set(("init", key), value)
+            tensordict.set(below(self.init_key, key), value)
         return tensordict
 
     def initial_state(
@@ -285,7 +307,7 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
     drawn with probability `uniform_share / bins + (1 - uniform_share) * failures`, failures normalised.
 
     Args:
-        start: `uniform` as long as nothing has failed, or `first`, always.
+        start: `uniform` as long as nothing has failed; `first` or a frame, always.
         bins: number of bins. uniform_share: of starts that ignore failures. decay: of the average, per reset in
             which any episode has ended. lead: frames before the failure's bin that the start is moved ahead.
     """
@@ -293,25 +315,35 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
     def __init__(
         self,
         reference: Reference,
-        start: Literal["uniform", "first"] = "uniform",
+        joint_ranges: Sequence[Sequence[float]],
+        start: Literal["uniform", "first"] | int = "uniform",
         margin: int = 1,
         noise: Mapping[str, float | Sequence[float]] | None = None,
         held_noise: float = 1.0,
         first_share: float = 0.0,
         soft_limit: float = 0.95,
-        limits: Sequence[Sequence[float]] = g1.JOINT_RANGES,
         starts: StartTables | None = None,
         bins: int = 20,
         uniform_share: float = 0.5,
         decay: float = 0.999,
         lead: int = 25,
+        terminated_key: NestedKey = "terminated",
+        step_key: NestedKey = ("ref", "step"),
+        init_key: NestedKey = "init",
+        scale_key: NestedKey = ("init", "object_scale"),
+        frame_key: NestedKey = FRAME_KEY,
+        noise_share_key: NestedKey = NOISE_SHARE_KEY,
     ):
-        super().__init__(reference, start, margin, noise, held_noise, first_share, soft_limit, limits, starts)
+        super().__init__(
+            reference, joint_ranges, start, margin, noise, held_noise, first_share, soft_limit, starts,
+            init_key, scale_key, frame_key, noise_share_key,
+        )  # fmt: skip
+        self.terminated_key, self.step_key = key_of(terminated_key), key_of(step_key)
         self.uniform_share, self.decay, self.lead = uniform_share, decay, lead
         self.register_buffer("failures", torch.zeros(bins))
 
     def sample_frames(self, batch_size: torch.Size, device: torch.device | None) -> Tensor:
-        if self.start == "first":
+        if not isinstance(self.start, str):
             return super().sample_frames(batch_size, device)
         bins, total = len(self.failures), self.failures.sum()
         uniform = torch.full_like(self.failures, 1 / bins)
@@ -323,8 +355,8 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         # a start that is drawn again has been counted
-        if tensordict is not None and NOISE_SHARE_KEY not in tensordict.keys(True):
-            self._count(tensordict.get("terminated", None), tensordict.get(("ref", "step"), None))
+        if tensordict is not None and self.noise_share_key not in tensordict.keys(True):
+            self._count(tensordict.get(self.terminated_key, None), tensordict.get(self.step_key, None))
         return super()._reset_env_preprocess(tensordict)
 
     def _count(self, terminated: Tensor | None, step: Tensor | None) -> None:
@@ -339,33 +371,46 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
 class MotionEnd(SpecTransform):
     """Truncates episodes that reach the last frame of the reference; value estimates bootstrap through it.
 
-    Reads next `step_key`; writes `truncated` and `done`, and bool [N, 1] `completed`.
+    Reads next `step_key` int64 [N, 1]; writes `truncated` and `done`, and bool [N, 1] `completed`, of those that no
+    termination ends in the same step.
     """
 
-    def __init__(self, reference: Reference, step_key: NestedKey = ("ref", "step")):
-        super().__init__(in_keys=[step_key], out_keys=["completed"])
+    def __init__(
+        self,
+        reference: Reference,
+        step_key: NestedKey = ("ref", "step"),
+        completed_key: NestedKey = "completed",
+        truncated_key: NestedKey = "truncated",
+        terminated_key: NestedKey = "terminated",
+        done_key: NestedKey = "done",
+    ):
+        super().__init__(in_keys=[key_of(step_key)], out_keys=[key_of(completed_key)])
         self.last = reference.num_frames - 1
+        self.truncated_key, self.terminated_key = key_of(truncated_key), key_of(terminated_key)
+        self.done_key = key_of(done_key)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         ended = next_tensordict.get(self.in_keys[0]) >= self.last
-        next_tensordict.set("completed", ended & ~next_tensordict.get("terminated"))
-        set_terminated(next_tensordict, ended, "truncated")
+        next_tensordict.set(self.out_keys[0], ended & ~next_tensordict.get(self.terminated_key))
+        raise_done(next_tensordict, ended, self.truncated_key, self.done_key)
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        done = tensordict_reset.get("done")
-        tensordict_reset.set("completed", torch.zeros_like(done))
-        tensordict_reset.set("truncated", torch.zeros_like(done))
+        done = tensordict_reset.get(self.done_key)
+        tensordict_reset.set(self.out_keys[0], torch.zeros_like(done))
+        tensordict_reset.set(self.truncated_key, torch.zeros_like(done))
         return tensordict_reset
 
     def transform_done_spec(self, done_spec: Composite) -> Composite:
-        if "truncated" not in set(done_spec.keys()):
-            done_spec["truncated"] = done_spec["done"].clone()
+        if self.truncated_key not in done_spec.keys(True, True):
+            done_spec = copied(done_spec)
+            done_spec[self.truncated_key] = done_spec[self.done_key].clone()
         return done_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        observation_spec = copied(observation_spec)
         flag = torch.zeros(*observation_spec.shape, 1, dtype=torch.bool, device=observation_spec.device)
-        observation_spec["completed"] = spec_like(flag)
+        observation_spec[self.out_keys[0]] = spec_like(flag)
         return observation_spec
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

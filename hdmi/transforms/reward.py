@@ -1,38 +1,51 @@
-"""The paper's reward table as transforms: each adds one weighted, logged term to the reward."""
+"""The paper's reward table as transforms: each adds one weighted, logged term to the reward.
+
+A row of the table is a kernel bound to keys. `KernelReward` binds any; the classes below it are the paper's rows with
+their names, weights and keys as defaults.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import TensorSpec
+from torchrl.data import Composite
 
 from hdmi import functional as F
-from hdmi.assets import g1, match_names
-from hdmi.transforms.common import SpecTransform, soft_limits
+from hdmi.names import match_names
+from hdmi.transforms.common import BoundKernel, SpecTransform, below, copied, key_of, soft_limits, spec_like
 
-
-def _keys(keys: Sequence[NestedKey | Sequence[str]]) -> list[NestedKey]:
-    """Nested keys that may have come from a config as lists."""
-    return [key if isinstance(key, str) else tuple(key) for key in keys]
+_GRAVITY = 9.81  # m/s^2
 
 
 class RewardTerm(SpecTransform):
     """Adds `weight * function(next[in_keys])` to the reward and writes the raw term beside it.
 
-    Reads its in_keys from the next tensordict; writes `reward_terms/<name>` [N, 1] and adds to `reward_key`.
-    A term of zero weight is computed and logged all the same.
+    Reads its in_keys from the next tensordict; writes `term_key` [N, 1], an observation that is zero after a reset, and
+    adds to `reward_key`. A term of zero weight is computed and logged all the same.
+
+    Args:
+        term_key: `reward_terms/<name>` if absent.
+
+    Raises:
+        ValueError: from the specs, if the function does not give [N, 1].
     """
 
     def __init__(
-        self, name: str, in_keys: Sequence[NestedKey | Sequence[str]], weight: float, reward_key: NestedKey = "reward"
+        self,
+        name: str,
+        in_keys: Sequence[NestedKey | Sequence[str]],
+        weight: float,
+        reward_key: NestedKey = "reward",
+        term_key: NestedKey | None = None,
     ):
-        super().__init__(in_keys=_keys(in_keys), out_keys=[("reward_terms", name)])
-        self.weight = weight
-        self.reward_key = reward_key
+        term_key = below("reward_terms", name) if term_key is None else key_of(term_key)
+        super().__init__(in_keys=[key_of(key) for key in in_keys], out_keys=[term_key])
+        self.name, self.weight = name, weight
+        self.reward_key = key_of(reward_key)
 
     def function(self, *inputs: Tensor) -> Tensor:
         """The unweighted term. [..., 1]"""
@@ -45,18 +58,61 @@ class RewardTerm(SpecTransform):
         next_tensordict.set(self.reward_key, next_tensordict.get(self.reward_key) + self.weight * term)
         return next_tensordict
 
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        zero = torch.zeros(*tensordict_reset.batch_size, 1, device=tensordict_reset.device)
+        return tensordict_reset.set(self.out_keys[0], zero)
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Recomputes the term on recorded transitions, in their `next`."""
         # shallow copies: a replay buffer may hand out what it stores
         return tensordict.copy().set("next", self._step(tensordict, tensordict.get("next").copy()))
 
-    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
-        reward_spec[self.out_keys[0]] = reward_spec[self.reward_key].clone()
-        return reward_spec
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        observation_spec = copied(observation_spec)
+        term = torch.zeros(*observation_spec.shape, 1, device=observation_spec.device)
+        there = observation_spec.keys(True, True)
+        if all(key in there for key in self.in_keys):  # else some are of the done spec
+            found = self.function(*(observation_spec[key].zero() for key in self.in_keys))
+            if found.shape != term.shape:
+                raise ValueError(
+                    f"reward {self.name!r}: expected one figure for each world, {list(term.shape)}, got "
+                    f"{list(found.shape)} from {self.in_keys}"
+                )
+        observation_spec[self.out_keys[0]] = spec_like(term)
+        return observation_spec
 
 
-class TrackingReward(RewardTerm):
-    """Mean of the kernels exp(-mean error / sigma) of several errors; see `functional.tracking`.
+class KernelReward(RewardTerm):
+    """A reward term that is a kernel bound to keys: `weight * function(*next[keys], **parameters)`.
+
+    Args:
+        function: gives [N, 1] from the entries; itself, or its dotted name, such as `hdmi.functional.feet_slip`.
+        keys: of its tensors, in its order.
+        parameters: its keyword arguments.
+
+    Raises:
+        ValueError: if there is no such function, or it does not take these keys and parameters.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Tensor] | str,
+        keys: Sequence[NestedKey | Sequence[str]],
+        name: str,
+        weight: float = 1.0,
+        reward_key: NestedKey = "reward",
+        term_key: NestedKey | None = None,
+        **parameters: Any,
+    ):
+        super().__init__(name, keys, weight, reward_key, term_key)
+        self.kernel = BoundKernel(function, len(self.in_keys), f"reward {name!r}", parameters)
+
+    def function(self, *inputs: Tensor) -> Tensor:
+        return self.kernel(*inputs)
+
+
+class TrackingReward(KernelReward):
+    """Mean of the kernels exp(-mean error / sigma) of several errors; see `functional.tracking_mean`.
 
     Serves Body Local Pose, Root Global Pose, Body Global Velocity, Joint Tracking, Object Pose and the object's
     joint: which errors and how wide is configuration.
@@ -74,24 +130,20 @@ class TrackingReward(RewardTerm):
         sigmas: Sequence[float],
         tolerances: Sequence[float] | None = None,
         reward_key: NestedKey = "reward",
+        term_key: NestedKey | None = None,
     ):
-        super().__init__(name, errors, weight, reward_key)
-        self.sigmas = [float(s) for s in sigmas]
-        self.tolerances = [0.0] * len(self.sigmas) if tolerances is None else [float(t) for t in tolerances]
-        if not len(self.in_keys) == len(self.sigmas) == len(self.tolerances):
-            raise ValueError(f"reward {name!r}: give one sigma and tolerance for each of {self.in_keys}")
-        if min(self.sigmas) <= 0:
-            raise ValueError(f"reward {name!r}: sigmas must be positive, got {self.sigmas}")
-
-    def function(self, *inputs: Tensor) -> Tensor:
-        kernels = [
-            F.tracking(error, sigma=sigma, tolerance=tolerance)
-            for error, sigma, tolerance in zip(inputs, self.sigmas, self.tolerances, strict=True)
-        ]
-        return torch.stack(kernels).mean(0)
+        sigmas = tuple(float(s) for s in sigmas)
+        tolerances = (0.0,) * len(sigmas) if tolerances is None else tuple(float(t) for t in tolerances)
+        if not len(errors) == len(sigmas) == len(tolerances):
+            raise ValueError(f"reward {name!r}: give one sigma and tolerance for each of {list(errors)}")
+        if min(sigmas) <= 0:
+            raise ValueError(f"reward {name!r}: sigmas must be positive, got {list(sigmas)}")
+        super().__init__(
+            F.tracking_mean, errors, name, weight, reward_key, term_key, sigmas=sigmas, tolerances=tolerances
+        )  # fmt: skip
 
 
-class InteractionReward(RewardTerm):
+class InteractionReward(KernelReward):
     """Unified interaction reward (section III-B-3); see `functional.interaction`."""
 
     def __init__(
@@ -108,32 +160,29 @@ class InteractionReward(RewardTerm):
         force_key: NestedKey = ("contact", "force"),
         active_key: NestedKey = ("ref", "contact"),
         reward_key: NestedKey = "reward",
+        term_key: NestedKey | None = None,
     ):
         if reduce not in ("mean", "max"):
             raise ValueError(f"reward {name!r}: reduce is 'mean' or 'max', got {reduce!r}")
-        super().__init__(name, [eef_pos_key, target_pos_key, force_key, active_key], weight, reward_key)
-        self.sigma_pos, self.sigma_frc, self.force_threshold = sigma_pos, sigma_frc, force_threshold
-        self.tolerance, self.reduce = tolerance, reduce
-
-    def function(self, *inputs: Tensor) -> Tensor:
-        return F.interaction(
-            *inputs,
-            sigma_pos=self.sigma_pos,
-            sigma_frc=self.sigma_frc,
-            force_threshold=self.force_threshold,
-            tolerance=self.tolerance,
-            reduce=self.reduce,
-        )
+        super().__init__(
+            F.interaction, [eef_pos_key, target_pos_key, force_key, active_key], name, weight, reward_key, term_key,
+            sigma_pos=sigma_pos, sigma_frc=sigma_frc, force_threshold=force_threshold, tolerance=tolerance,
+            reduce=reduce,
+        )  # fmt: skip
 
 
-class SurvivalReward(RewardTerm):
-    """One for every step that does not terminate."""
+class SurvivalReward(KernelReward):
+    """One for every step that does not terminate; stands behind the terminations."""
 
-    def __init__(self, name: str = "survival", weight: float = 1.0, reward_key: NestedKey = "reward"):
-        super().__init__(name, ["terminated"], weight, reward_key)
-
-    def function(self, *inputs: Tensor) -> Tensor:
-        return (~inputs[0]).float()
+    def __init__(
+        self,
+        name: str = "survival",
+        weight: float = 1.0,
+        terminated_key: NestedKey = "terminated",
+        reward_key: NestedKey = "reward",
+        term_key: NestedKey | None = None,
+    ):
+        super().__init__(F.alive, [terminated_key], name, weight, reward_key, term_key)
 
 
 class ActionRateL2(RewardTerm):
@@ -145,58 +194,61 @@ class ActionRateL2(RewardTerm):
         weight: float = -0.1,
         history_key: NestedKey = "action_history",
         reward_key: NestedKey = "reward",
+        term_key: NestedKey | None = None,
     ):
-        super().__init__(name, [history_key], weight, reward_key)
+        super().__init__(name, [history_key], weight, reward_key, term_key)
 
     def function(self, *inputs: Tensor) -> Tensor:
         return F.action_rate(inputs[0][..., 0, :], inputs[0][..., 1, :])
 
 
-class JointPosLimitsL1(RewardTerm):
+class JointPosLimitsL1(KernelReward):
     """Distance of joints beyond a share of their range, rad; see `functional.limit_excess`.
 
     Args:
+        joint_ranges: rad. [J, 2]
         soft_limit: share of the range, about its middle, that costs nothing.
     """
 
     def __init__(
         self,
+        joint_ranges: Sequence[Sequence[float]],
         name: str = "joint_pos_limits",
         weight: float = -10.0,
         soft_limit: float = 0.95,
         joint_pos_key: NestedKey = ("robot", "joint_pos"),
-        limits: Sequence[Sequence[float]] = g1.JOINT_RANGES,
         reward_key: NestedKey = "reward",
+        term_key: NestedKey | None = None,
     ):
-        super().__init__(name, [joint_pos_key], weight, reward_key)
-        low, high = soft_limits(limits, soft_limit)
-        self.register_buffer("low", low, persistent=False)
-        self.register_buffer("high", high, persistent=False)
-
-    def function(self, *inputs: Tensor) -> Tensor:
-        return F.limit_excess(inputs[0], self.low, self.high)
+        low, high = soft_limits(joint_ranges, soft_limit)
+        super().__init__(F.limit_excess, [joint_pos_key], name, weight, reward_key, term_key, low=low, high=high)
 
 
-class JointTorqueLimitsL1(RewardTerm):
-    """Torque beyond a share of the effort limit, N m; see `functional.limit_excess`."""
+class JointTorqueLimitsL1(KernelReward):
+    """Torque beyond a share of the effort limit, N m; see `functional.limit_excess`.
+
+    Args:
+        effort_limits: N m. [J]
+        soft_limit: share of them that costs nothing.
+    """
 
     def __init__(
         self,
+        effort_limits: Sequence[float],
         name: str = "joint_torque_limits",
         weight: float = -0.01,
         soft_limit: float = 0.9,
         joint_torque_key: NestedKey = ("robot", "joint_torque"),
-        limits: Sequence[float] = g1.EFFORT_LIMITS,
         reward_key: NestedKey = "reward",
+        term_key: NestedKey | None = None,
     ):
-        super().__init__(name, [joint_torque_key], weight, reward_key)
-        self.register_buffer("limit", soft_limit * torch.tensor(list(limits), dtype=torch.float32), persistent=False)
+        limit = soft_limit * torch.tensor(list(effort_limits), dtype=torch.float32)
+        super().__init__(
+            F.limit_excess, [joint_torque_key], name, weight, reward_key, term_key, low=-limit, high=limit
+        )  # fmt: skip
 
-    def function(self, *inputs: Tensor) -> Tensor:
-        return F.limit_excess(inputs[0], -self.limit, self.limit)
 
-
-class JointVelL2(RewardTerm):
+class JointVelL2(KernelReward):
     """Squared joint velocity, (rad/s)^2, summed over joints."""
 
     def __init__(
@@ -205,47 +257,54 @@ class JointVelL2(RewardTerm):
         weight: float = -5.0e-4,
         joint_vel_key: NestedKey = ("robot", "joint_vel"),
         reward_key: NestedKey = "reward",
+        term_key: NestedKey | None = None,
     ):
-        super().__init__(name, [joint_vel_key], weight, reward_key)
-
-    def function(self, *inputs: Tensor) -> Tensor:
-        return inputs[0].square().sum(-1, keepdim=True)
+        super().__init__(F.sum_of_squares, [joint_vel_key], name, weight, reward_key, term_key)
 
 
-class FeetImpactL2(RewardTerm):
-    """Hard landings; see `functional.feet_impact`."""
+class FeetImpactL2(KernelReward):
+    """Hard landings; see `functional.feet_impact`.
+
+    Args:
+        robot_mass: kg.
+    """
 
     def __init__(
         self,
+        robot_mass: float,
         name: str = "feet_impact",
         weight: float = -1.0,
-        weight_force: float = 9.81 * g1.TOTAL_MASS,
         force_key: NestedKey = ("feet", "force"),
         previous_key: NestedKey = ("feet", "previous_force"),
         reward_key: NestedKey = "reward",
+        term_key: NestedKey | None = None,
     ):
-        super().__init__(name, [force_key, previous_key], weight, reward_key)
-        self.weight_force = weight_force
-
-    def function(self, *inputs: Tensor) -> Tensor:
-        return F.feet_impact(*inputs, weight_force=self.weight_force)
+        super().__init__(
+            F.feet_impact, [force_key, previous_key], name, weight, reward_key, term_key,
+            weight_force=_GRAVITY * robot_mass,
+        )  # fmt: skip
 
 
 class FeetSlip(RewardTerm):
-    """Feet that move under load; see `functional.feet_slip`."""
+    """Feet that move under load; see `functional.feet_slip`.
+
+    Args:
+        feet: names of their bodies, among `body_names`.
+    """
 
     def __init__(
         self,
+        feet: Sequence[str],
+        body_names: Sequence[str],
         name: str = "feet_slip",
         weight: float = -0.5,
         force_threshold: float = 5.0,
         velocity_key: NestedKey = ("robot", "body_lin_vel"),
         force_key: NestedKey = ("robot", "foot_force"),
-        body_names: Sequence[str] = g1.BODY_NAMES,
-        feet: Sequence[str] = g1.FEET,
         reward_key: NestedKey = "reward",
+        term_key: NestedKey | None = None,
     ):
-        super().__init__(name, [velocity_key, force_key], weight, reward_key)
+        super().__init__(name, [velocity_key, force_key], weight, reward_key, term_key)
         index = torch.as_tensor(match_names(feet, body_names, f"reward {name!r}"))
         self.register_buffer("feet", index, persistent=False)
         self.force_threshold = force_threshold
@@ -255,7 +314,7 @@ class FeetSlip(RewardTerm):
         return F.feet_slip(velocity[..., self.feet, :], force, force_threshold=self.force_threshold)
 
 
-class FeetStumble(RewardTerm):
+class FeetStumble(KernelReward):
     """Feet that run into the edge of a step; see `functional.feet_stumble`. Reads `robot/foot_force` [N, 2, 3]."""
 
     def __init__(
@@ -265,15 +324,12 @@ class FeetStumble(RewardTerm):
         ratio: float = 4.0,
         force_key: NestedKey = ("robot", "foot_force"),
         reward_key: NestedKey = "reward",
+        term_key: NestedKey | None = None,
     ):
-        super().__init__(name, [force_key], weight, reward_key)
-        self.ratio = ratio
-
-    def function(self, *inputs: Tensor) -> Tensor:
-        return F.feet_stumble(inputs[0], ratio=self.ratio)
+        super().__init__(F.feet_stumble, [force_key], name, weight, reward_key, term_key, ratio=ratio)
 
 
-class FeetAirTime(RewardTerm):
+class FeetAirTime(KernelReward):
     """Swings shorter than a threshold; see `functional.feet_air_time`."""
 
     def __init__(
@@ -284,12 +340,10 @@ class FeetAirTime(RewardTerm):
         swing_time_key: NestedKey = ("feet", "swing_time"),
         touchdown_key: NestedKey = ("feet", "touchdown"),
         reward_key: NestedKey = "reward",
+        term_key: NestedKey | None = None,
     ):
-        super().__init__(name, [swing_time_key, touchdown_key], weight, reward_key)
-        self.threshold = threshold
-
-    def function(self, *inputs: Tensor) -> Tensor:
-        return F.feet_air_time(*inputs, threshold=self.threshold)
+        keys = [swing_time_key, touchdown_key]
+        super().__init__(F.feet_air_time, keys, name, weight, reward_key, term_key, threshold=threshold)
 
 
 class RewardRate(SpecTransform):
@@ -302,7 +356,7 @@ class RewardRate(SpecTransform):
     """
 
     def __init__(self, control_dt: float, reward_key: NestedKey = "reward"):
-        super().__init__(in_keys=[reward_key], out_keys=[reward_key])
+        super().__init__(in_keys=[key_of(reward_key)], out_keys=[key_of(reward_key)])
         self.control_dt = control_dt
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

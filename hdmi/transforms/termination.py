@@ -1,9 +1,12 @@
-"""The paper's termination conditions as transforms: an error that stays above its threshold ends the episode."""
+"""The paper's termination conditions as transforms: an error that stays above its threshold ends the episode.
+
+A row of the table is a kernel bound to keys. `KernelTermination` binds any; the classes below it are the paper's rows.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -11,24 +14,37 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from hdmi import functional as F
-from hdmi.assets import g1, match_names
-from hdmi.transforms.common import StateTransform, set_terminated, spec_like
+from hdmi.names import match_names
+from hdmi.transforms.common import BoundKernel, StateTransform, below, key_of, raise_done, spec_like
 
 
 class TerminationTerm(StateTransform):
     """Terminates when a condition has held for `min_steps` consecutive steps.
 
-    Reads its in_keys from the next tensordict and the count from the present one; writes
-    `termination_steps/<name>` int64 [N, 1] and `termination/<name>` bool [N, 1]; raises `terminated` and `done`.
+    Reads its in_keys from the next tensordict and the count from the present one; writes `count_key` int64 [N, 1], its
+    state, and `flag_key` bool [N, 1]; raises `terminated` and `done`.
+
+    Args:
+        flag_key, count_key: `termination/<name>` and `termination_steps/<name>` if absent.
     """
 
-    def __init__(self, name: str, in_keys: Sequence[NestedKey | Sequence[str]], min_steps: int):
-        keys = [key if isinstance(key, str) else tuple(key) for key in in_keys]
-        super().__init__(in_keys=keys, out_keys=[("termination", name)])
+    def __init__(
+        self,
+        name: str,
+        in_keys: Sequence[NestedKey | Sequence[str]],
+        min_steps: int,
+        terminated_key: NestedKey = "terminated",
+        done_key: NestedKey = "done",
+        flag_key: NestedKey | None = None,
+        count_key: NestedKey | None = None,
+    ):
+        flag_key = below("termination", name) if flag_key is None else key_of(flag_key)
+        super().__init__(in_keys=[key_of(key) for key in in_keys], out_keys=[flag_key])
         if min_steps < 1:
             raise ValueError(f"termination {name!r}: min_steps must be at least 1, got {min_steps}")
         self.min_steps = min_steps
-        self.count_key: NestedKey = ("termination_steps", name)
+        self.count_key = below("termination_steps", name) if count_key is None else key_of(count_key)
+        self.terminated_key, self.done_key = key_of(terminated_key), key_of(done_key)
 
     def condition(self, *inputs: Tensor) -> Tensor:
         """Whether the condition holds in this step. bool [N, 1]"""
@@ -49,7 +65,7 @@ class TerminationTerm(StateTransform):
         fired = count >= self.min_steps
         next_tensordict.set(self.count_key, count)
         next_tensordict.set(self.out_keys[0], fired)
-        set_terminated(next_tensordict, fired)
+        raise_done(next_tensordict, fired, self.terminated_key, self.done_key)
         return next_tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -59,25 +75,64 @@ class TerminationTerm(StateTransform):
         return observation_spec
 
 
-class ErrorTermination(TerminationTerm):
+class KernelTermination(TerminationTerm):
+    """A termination whose condition is a kernel bound to keys: `function(*next[keys], **parameters)`.
+
+    Args:
+        function: gives bool [N, 1] from the entries; itself, or its dotted name, such as
+            `hdmi.functional.contact_lost`.
+        keys: of its tensors, in its order.
+        parameters: its keyword arguments.
+
+    Raises:
+        ValueError: if there is no such function, or it does not take these keys and parameters.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Tensor] | str,
+        keys: Sequence[NestedKey | Sequence[str]],
+        name: str,
+        min_steps: int = 25,
+        terminated_key: NestedKey = "terminated",
+        done_key: NestedKey = "done",
+        flag_key: NestedKey | None = None,
+        count_key: NestedKey | None = None,
+        **parameters: Any,
+    ):
+        super().__init__(name, keys, min_steps, terminated_key, done_key, flag_key, count_key)
+        self.kernel = BoundKernel(function, len(self.in_keys), f"termination {name!r}", parameters)
+
+    def condition(self, *inputs: Tensor) -> Tensor:
+        return self.kernel(*inputs)
+
+
+class ErrorTermination(KernelTermination):
     """Root, body-local and object pose errors: any of the errors above its threshold.
 
     Args:
         errors: keys of errors [N, K]. thresholds: one per error, in its unit.
     """
 
-    def __init__(self, name: str, errors: Sequence[NestedKey], thresholds: Sequence[float], min_steps: int = 25):
-        super().__init__(name, errors, min_steps)
-        self.thresholds = [float(t) for t in thresholds]
-        if len(self.thresholds) != len(self.in_keys):
-            raise ValueError(f"termination {name!r}: give one threshold for each of {self.in_keys}")
+    def __init__(
+        self,
+        name: str,
+        errors: Sequence[NestedKey],
+        thresholds: Sequence[float],
+        min_steps: int = 25,
+        terminated_key: NestedKey = "terminated",
+        done_key: NestedKey = "done",
+        flag_key: NestedKey | None = None,
+        count_key: NestedKey | None = None,
+    ):
+        thresholds = tuple(float(t) for t in thresholds)
+        if len(thresholds) != len(errors):
+            raise ValueError(f"termination {name!r}: give one threshold for each of {list(errors)}")
+        keys = (terminated_key, done_key, flag_key, count_key)
+        super().__init__(F.any_error_exceeds, errors, name, min_steps, *keys, thresholds=thresholds)
 
-    def condition(self, *inputs: Tensor) -> Tensor:
-        exceeded = [F.error_exceeds(e, t) for e, t in zip(inputs, self.thresholds, strict=True)]
-        return torch.stack(exceeded).any(0)
 
-
-class LostContact(TerminationTerm):
+class LostContact(KernelTermination):
     """An intended contact is lost: too far from its contact point, or without force; see `functional.contact_lost`.
 
     Reads `contact/{eef_pos, target_pos, force}` [N, E, 3] (m, m, N) and `ref/contact` bool [N, E].
@@ -101,30 +156,41 @@ class LostContact(TerminationTerm):
         target_pos_key: NestedKey = ("contact", "target_pos"),
         force_key: NestedKey = ("contact", "force"),
         active_key: NestedKey = ("ref", "contact"),
+        terminated_key: NestedKey = "terminated",
+        done_key: NestedKey = "done",
+        flag_key: NestedKey | None = None,
+        count_key: NestedKey | None = None,
     ):
-        super().__init__(name, [eef_pos_key, target_pos_key, force_key, active_key], min_steps)
         if require not in ("either", "both"):
             raise ValueError(f"termination {name!r}: require is 'either' or 'both', got {require!r}")
-        self.distance, self.min_force = distance, min_force
-        self.require: Literal["either", "both"] = require
-
-    def condition(self, *inputs: Tensor) -> Tensor:
-        return F.contact_lost(*inputs, distance=self.distance, min_force=self.min_force, require=self.require)
+        super().__init__(
+            F.contact_lost, [eef_pos_key, target_pos_key, force_key, active_key], name, min_steps,
+            terminated_key, done_key, flag_key, count_key,
+            distance=distance, min_force=min_force, require=require,
+        )  # fmt: skip
 
 
 class BodyHeight(TerminationTerm):
-    """A body (the torso) is lower over the floor than a threshold, m, whatever the reference does."""
+    """A body (the torso) is lower over the floor than a threshold, m, whatever the reference does.
+
+    Args:
+        body: among `body_names`, those of `body_pos_key` [N, B, 3].
+    """
 
     def __init__(
         self,
+        body: str,
+        body_names: Sequence[str],
         name: str = "torso_height",
         threshold: float = 0.3,
         min_steps: int = 25,
-        body: str = "torso_link",
         body_pos_key: NestedKey = ("robot", "body_pos"),
-        body_names: Sequence[str] = g1.BODY_NAMES,
+        terminated_key: NestedKey = "terminated",
+        done_key: NestedKey = "done",
+        flag_key: NestedKey | None = None,
+        count_key: NestedKey | None = None,
     ):
-        super().__init__(name, [body_pos_key], min_steps)
+        super().__init__(name, [body_pos_key], min_steps, terminated_key, done_key, flag_key, count_key)
         self.body = match_names([body], body_names, f"termination {name!r}")[0]
         self.threshold = threshold
 

@@ -3,33 +3,49 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from hdmi.assets import Effector, g1, match_names
 from hdmi.functional import local_pose, quat_angle, quat_apply
-from hdmi.transforms.common import FunctionTransform, StateTransform
+from hdmi.names import match_names
+from hdmi.transforms.common import FunctionTransform, StateTransform, below, key_of
 
-_BODY_KEYS = ("body_pos", "body_quat", "body_lin_vel", "body_ang_vel")
+if TYPE_CHECKING:
+    from hdmi.assets import Effector
 
 
 class TrackedBodies(FunctionTransform):
     """Selects the robot's tracked bodies and adds their poses in the root's yaw frame at its ground projection.
 
     Reads `robot/body_{pos, quat, lin_vel, ang_vel}` [N, B, *] and `robot/root_{pos, quat}`; writes the same for K
-    bodies under `tracked`, and `tracked/body_{pos, quat}_local` [N, K, *].
+    bodies under `out_key`, and there `body_{pos, quat}_local` [N, K, *].
 
     Args:
         tracked_bodies: name patterns.
         body_names: of the B bodies.
+        out_key: under which the six entries go.
     """
 
-    def __init__(self, tracked_bodies: Sequence[str], body_names: Sequence[str] = g1.BODY_NAMES):
-        outs = [("tracked", key) for key in (*_BODY_KEYS, "body_pos_local", "body_quat_local")]
-        ins = [("robot", key) for key in (*_BODY_KEYS, "root_pos", "root_quat")]
-        super().__init__(ins, outs)
+    def __init__(
+        self,
+        tracked_bodies: Sequence[str],
+        body_names: Sequence[str],
+        body_pos_key: NestedKey = ("robot", "body_pos"),
+        body_quat_key: NestedKey = ("robot", "body_quat"),
+        body_lin_vel_key: NestedKey = ("robot", "body_lin_vel"),
+        body_ang_vel_key: NestedKey = ("robot", "body_ang_vel"),
+        root_pos_key: NestedKey = ("robot", "root_pos"),
+        root_quat_key: NestedKey = ("robot", "root_quat"),
+        out_key: NestedKey = "tracked",
+    ):
+        outs = ("body_pos", "body_quat", "body_lin_vel", "body_ang_vel", "body_pos_local", "body_quat_local")
+        super().__init__(
+            [body_pos_key, body_quat_key, body_lin_vel_key, body_ang_vel_key, root_pos_key, root_quat_key],
+            [below(out_key, name) for name in outs],
+        )
         index = torch.as_tensor(match_names(tracked_bodies, body_names, "tracked_bodies"))
         self.register_buffer("index", index, persistent=False)
 
@@ -86,10 +102,10 @@ class BodyHeightError(FunctionTransform):
         self,
         body: str,
         tracked_bodies: Sequence[str],
+        body_names: Sequence[str],
         a_key: NestedKey = ("tracked", "body_pos"),
         b_key: NestedKey = ("ref", "body_pos"),
         out_key: NestedKey = ("error", "torso_height"),
-        body_names: Sequence[str] = g1.BODY_NAMES,
     ):
         super().__init__([a_key, b_key], [out_key])
         tracked = [body_names[i] for i in match_names(tracked_bodies, body_names, "tracked_bodies")]
@@ -100,10 +116,10 @@ class BodyHeightError(FunctionTransform):
 
 
 class JointErrors(AbsoluteDifference):
-    """Absolute error of the tracked joints. [..., 29], [..., 29] -> [..., J']
+    """Absolute error of the tracked joints. [..., J], [..., J] -> [..., J']
 
     Args:
-        tracked_joints: name patterns.
+        tracked_joints: name patterns. joint_names: of the J joints.
     """
 
     def __init__(
@@ -112,7 +128,7 @@ class JointErrors(AbsoluteDifference):
         b_key: NestedKey,
         out_key: NestedKey,
         tracked_joints: Sequence[str],
-        joint_names: Sequence[str] = g1.JOINT_NAMES,
+        joint_names: Sequence[str],
     ):
         super().__init__(a_key, b_key, out_key, match_names(tracked_joints, joint_names, "tracked_joints"))
 
@@ -128,19 +144,28 @@ class ContactPoints(FunctionTransform):
     Reads `robot/body_{pos, quat}` [N, B, *], `object/link_{pos, quat}` [N, *], `object/scale` [N, 1] and
     `ref/contact_point` [N, E, 3] (link frame, m, scaled with the object);
     writes `contact/eef_pos` and `contact/target_pos` [N, E, 3], m.
+
+    Args:
+        effectors: their bodies, and the point of each in the frame of its body.
+        body_names: of the B bodies.
     """
 
-    def __init__(self, effectors: Sequence[Effector], body_names: Sequence[str] = g1.BODY_NAMES):
+    def __init__(
+        self,
+        effectors: Sequence[Effector],
+        body_names: Sequence[str],
+        body_pos_key: NestedKey = ("robot", "body_pos"),
+        body_quat_key: NestedKey = ("robot", "body_quat"),
+        link_pos_key: NestedKey = ("object", "link_pos"),
+        link_quat_key: NestedKey = ("object", "link_quat"),
+        scale_key: NestedKey = ("object", "scale"),
+        contact_point_key: NestedKey = ("ref", "contact_point"),
+        eef_pos_key: NestedKey = ("contact", "eef_pos"),
+        target_pos_key: NestedKey = ("contact", "target_pos"),
+    ):
         super().__init__(
-            [
-                ("robot", "body_pos"),
-                ("robot", "body_quat"),
-                ("object", "link_pos"),
-                ("object", "link_quat"),
-                ("object", "scale"),
-                ("ref", "contact_point"),
-            ],
-            [("contact", "eef_pos"), ("contact", "target_pos")],
+            [body_pos_key, body_quat_key, link_pos_key, link_quat_key, scale_key, contact_point_key],
+            [eef_pos_key, target_pos_key],
         )
         index = [match_names([e.body], body_names, "effectors")[0] for e in effectors]
         self.register_buffer("index", torch.as_tensor(index), persistent=False)
@@ -158,48 +183,49 @@ class ContactPoints(FunctionTransform):
 class FeetState(StateTransform):
     """Contact history of the feet, for the regularization rewards.
 
-    Reads next `robot/foot_force` [N, 2, 3]; writes under `feet`: `force`, `previous_force` [N, 2, 3], N;
+    Reads next `robot/foot_force` [N, 2, 3]; writes under `out_key`: `force`, `previous_force` [N, 2, 3], N;
     `air_time` [N, 2], s, zero in contact; `swing_time` [N, 2], s, of the swing that ends in this step;
     `touchdown` bool [N, 2].
 
     Args:
         control_dt: s. force_threshold: N, above which a foot is in contact.
+        out_key: under which the five entries go, which are its state, too.
     """
 
-    def __init__(self, control_dt: float, force_threshold: float = 5.0):
-        super().__init__()
+    def __init__(
+        self,
+        control_dt: float,
+        force_threshold: float = 5.0,
+        force_key: NestedKey = ("robot", "foot_force"),
+        out_key: NestedKey = "feet",
+    ):
+        names = ("force", "previous_force", "air_time", "swing_time", "touchdown")
+        super().__init__(in_keys=[key_of(force_key)], out_keys=[below(out_key, name) for name in names])
         self.control_dt, self.force_threshold = control_dt, force_threshold
 
     def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(*batch_size, *shape, dtype=dtype, device=device)
 
-        return {
-            ("feet", "force"): zeros(2, 3),
-            ("feet", "previous_force"): zeros(2, 3),
-            ("feet", "air_time"): zeros(2),
-            ("feet", "swing_time"): zeros(2),
-            ("feet", "touchdown"): zeros(2, dtype=torch.bool),
-        }
+        values = (zeros(2, 3), zeros(2, 3), zeros(2), zeros(2), zeros(2, dtype=torch.bool))
+        return dict(zip(self.out_keys, values, strict=True))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         tensordict_reset = super()._reset(tensordict, tensordict_reset)
         # the first step must not count the load of standing as an impact
-        force = tensordict_reset.get(("robot", "foot_force"))
-        tensordict_reset.set(("feet", "force"), force)
-        tensordict_reset.set(("feet", "previous_force"), force.clone())
+        force = tensordict_reset.get(self.in_keys[0])
+        tensordict_reset.set(self.out_keys[0], force)
+        tensordict_reset.set(self.out_keys[1], force.clone())
         return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        force = next_tensordict.get(("robot", "foot_force"))
-        air_time = tensordict.get(("feet", "air_time")) + self.control_dt
+        force, before = next_tensordict.get(self.in_keys[0]), tensordict.get(self.out_keys[0])
+        air_time = tensordict.get(self.out_keys[2]) + self.control_dt
         contact = force.norm(dim=-1) > self.force_threshold
-        touchdown = contact & (tensordict.get(("feet", "air_time")) > 0)
-        next_tensordict.set(("feet", "force"), force)
-        next_tensordict.set(("feet", "previous_force"), tensordict.get(("feet", "force")))
-        next_tensordict.set(("feet", "air_time"), air_time * ~contact)
-        next_tensordict.set(("feet", "swing_time"), air_time * touchdown)
-        next_tensordict.set(("feet", "touchdown"), touchdown)
+        touchdown = contact & (tensordict.get(self.out_keys[2]) > 0)
+        values = (force, before, air_time * ~contact, air_time * touchdown, touchdown)
+        for key, value in zip(self.out_keys, values, strict=True):
+            next_tensordict.set(key, value)
         return next_tensordict
 
 
@@ -207,11 +233,14 @@ class Metrics(FunctionTransform):
     """Averages tensors over their features for logs and evaluation, without influence on training.
 
     Writes `metrics/<name>` [N, 1] = mean of the entry at `keys[name]` [N, K]; names without a key are left out.
+
+    Args:
+        out_key: under which they go.
     """
 
-    def __init__(self, keys: Mapping[str, NestedKey | Sequence[str] | None]):
-        given = {name: key if isinstance(key, str) else tuple(key) for name, key in keys.items() if key is not None}
-        super().__init__(list(given.values()), [("metrics", name) for name in given])
+    def __init__(self, keys: Mapping[str, NestedKey | Sequence[str] | None], out_key: NestedKey = "metrics"):
+        given = {name: key_of(key) for name, key in keys.items() if key is not None}
+        super().__init__(list(given.values()), [below(out_key, name) for name in given])
 
     def function(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         return tuple(value.float().mean(-1, keepdim=True) for value in inputs)
@@ -232,8 +261,10 @@ class ContactMade(FunctionTransform):
         min_force: float = 1.0,
         force_key: NestedKey = ("contact", "force"),
         active_key: NestedKey = ("ref", "contact"),
+        made_key: NestedKey = ("contact", "made"),
+        intended_key: NestedKey = ("contact", "intended"),
     ):
-        super().__init__([force_key, active_key], [("contact", "made"), ("contact", "intended")])
+        super().__init__([force_key, active_key], [made_key, intended_key])
         self.min_force = min_force
 
     def function(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
