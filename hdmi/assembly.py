@@ -28,6 +28,7 @@ from hdmi.config import ConfigError, build, build_dataclass, one_line, plain_con
 from hdmi.envs import HumanoidObjectEnv, MaskedResetEnv, PhysicsBackend, RowResetEnv
 from hdmi.motion import Reference, find_motion, make_reference
 from hdmi.motion.starts import StartTables, start_tables
+from hdmi.transforms import KernelReward, KernelTermination
 
 # What leaves the stack besides the state that steps read back.
 OUTPUTS = (
@@ -255,6 +256,12 @@ def _observations(cfg: DictConfig, context: Mapping[str, Any]) -> list[tuple[str
     return stack
 
 
+def _class_of(transform: Transform) -> str:
+    """The class, and of one that binds any kernel which one that is."""
+    name = type(transform).__name__
+    return f"{name}: {transform.kernel.name}" if type(transform) in (KernelReward, KernelTermination) else name
+
+
 def describe(transforms: list[tuple[str, Transform]]) -> Table:
     """The transform stack as a table: node, class, keys read and written, weight."""
     table = Table(title="Transform stack, from the base environment outwards", title_justify="left")
@@ -269,7 +276,5 @@ def describe(transforms: list[tuple[str, Transform]]) -> Table:
         reads = [*(transform.in_keys or []), *getattr(transform, "state_keys", []), *(transform.in_keys_inv or [])]
         writes = [*(transform.out_keys or []), *(transform.out_keys_inv or [])]
         weight = getattr(transform, "weight", None)
-        table.add_row(
-            name, type(transform).__name__, text(reads), text(writes), "" if weight is None else f"{weight:g}"
-        )
+        table.add_row(name, _class_of(transform), text(reads), text(writes), "" if weight is None else f"{weight:g}")
     return table

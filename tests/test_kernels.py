@@ -10,6 +10,8 @@ from torch import Tensor
 
 from hdmi.functional import (
     action_rate,
+    alive,
+    any_error_exceeds,
     body_velocity,
     contact_lost,
     error_exceeds,
@@ -25,7 +27,9 @@ from hdmi.functional import (
     quat_apply,
     quat_from_euler,
     quat_multiply,
+    sum_of_squares,
     tracking,
+    tracking_mean,
 )
 
 E1 = math.exp(-1)
@@ -40,6 +44,19 @@ def test_tracking():
     close(tracking(error, sigma=0.2), [[E1], [1.0]])  # means 0.2 and 0
     close(tracking(error, sigma=0.1, tolerance=0.1), [[E1], [1.0]])
     close(tracking(error, sigma=0.1, tolerance=0.5), [[1.0], [1.0]])
+
+
+def test_tracking_of_several_errors():
+    errors = torch.tensor([[0.25, 0.75]]), torch.tensor([[1.0]])  # 0.5 / 0.5; (1 - 0.5) / 1
+    close(tracking_mean(*errors, sigmas=(0.5, 1.0), tolerances=(0.0, 0.5)), [[(E1 + math.exp(-0.5)) / 2]])
+
+
+def test_small_ones():
+    close(sum_of_squares(torch.tensor([[1.0, -2.0]])), [[5.0]])
+    close(alive(torch.tensor([[True], [False]])), [[0.0], [1.0]])
+    errors = torch.tensor([[0.1, 0.3], [0.1, 0.1]]), torch.tensor([[1.0], [3.0]])
+    assert any_error_exceeds(*errors, thresholds=(0.2, 2.0)).tolist() == [[True], [True]]
+    assert any_error_exceeds(*errors, thresholds=(0.5, 2.0)).tolist() == [[False], [True]]
 
 
 class TestInteraction:
