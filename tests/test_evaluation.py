@@ -159,7 +159,7 @@ def test_the_protocol_starts_at_the_first_frame_and_keeps_what_was_trained():
     trained = load_config("reset=adaptive")
     cfg = evaluation_config(trained)
     assert cfg.reset.state._target_.endswith("ReferenceStateInitialization")
-    assert cfg.reset.state.start == "first"
+    assert cfg.reset.state.start == 0
     assert cfg.reset.state.noise == trained.reset.state.noise
     assert "bins" not in cfg.reset.state
     for group in ("randomization", "noise", "termination", "observation", "action"):
@@ -339,7 +339,7 @@ def test_an_agent_is_as_wide_as_the_environments_actions():
     result = evaluate_policy(agent, cfg, 1, lift_box(), whole_motion=False)
     assert result["survival"]["mean"] > 0
     assert not [name for name in result if name.endswith("_horizon")]
-    narrow = load_config("action.history.size=2")
+    narrow = load_config()
     narrow.action.joint_position.scale = {".*_knee_joint": 0.3}
     assert blind_agent("random", narrow, lift_box()).action_size == 2
 

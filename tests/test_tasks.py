@@ -329,7 +329,7 @@ class TestCheck:
     def test_the_same_policy_earns_the_same(self):
         # starts and randomization are drawn alike, so that only the policy makes a difference
         cfg = load_config()
-        task, agent = make_task(cfg), BlindAgent("zero", cfg.action.history.size)
+        task, agent = make_task(cfg), BlindAgent("zero", 23)
         with patch.multiple("hdmi.tasks.check", _RETURN_ENVS=8, _RETURN_STEPS=4):
             first, second = returns(cfg, task, agent), returns(cfg, task, agent)
         assert first.shape == (8,)
@@ -346,7 +346,7 @@ class TestCheck:
                 return super().forward(tensordict)
 
         with patch.multiple("hdmi.tasks.check", _RETURN_ENVS=2, _RETURN_STEPS=2):
-            returns(cfg, make_task(cfg), Agent("zero", cfg.action.history.size))
+            returns(cfg, make_task(cfg), Agent("zero", 23))
         assert modes == {ExplorationType.RANDOM}
 
     def test_a_negative_number_of_frames_is_refused(self):
