@@ -324,7 +324,19 @@ class TestCheck:
             with patch("hdmi.tasks.check._train", return_value=training):
                 found = check_task("lift_box", frames=1).problems
             assert len(found) == problems
+            assert all("training of 2 frames: " in problem for problem in found)
             assert all("in the median by -1.000" in problem for problem in found)
+
+    def test_a_second_training_has_twice_as_many_frames(self):
+        worse, better, asked = np.arange(20.0), np.arange(1.0, 21.0), []
+
+        def train(cfg, task):
+            asked.append(cfg.total_frames)
+            return Training(better, worse) if len(asked) == 1 else Training(worse, better)
+
+        with patch("hdmi.tasks.check._train", train):
+            assert check_task("lift_box", frames=64).problems == []
+        assert asked == [64, 128]
 
     def test_the_same_policy_earns_the_same(self):
         # starts and randomization are drawn alike, so that only the policy makes a difference
