@@ -52,7 +52,8 @@ class HingeConfig:
         geoms: of the link, in its frame.
         pos, quat: of the link in the base frame; the hinge passes through its origin.
         axis, range: of the hinge, in the link frame, rad.
-        friction: dry friction, N m. damping: N m s/rad.
+        friction: dry friction, N m.
+        damping: N m s/rad.
     """
 
     name: str

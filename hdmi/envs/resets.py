@@ -34,7 +34,8 @@ class RowResetEnv(TransformedEnv):
 
     Args:
         env, transform: as for `TransformedEnv`.
-        max_penetration: m. redraws: at most; with 0 every start is taken as it comes.
+        max_penetration: m.
+        redraws: at most; with 0 every start is taken as it comes.
     """
 
     def __init__(self, env: EnvBase, transform: Transform, *, max_penetration: float = 0.02, redraws: int = 0):

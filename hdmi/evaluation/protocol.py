@@ -189,7 +189,9 @@ class FirstEpisodes:
     there on the last ones count.
 
     Args:
-        num_envs: environments. horizon: steps of a full episode. causes: termination names, the first has precedence.
+        num_envs: environments.
+        horizon: steps of a full episode.
+        causes: termination names, the first has precedence.
         whole_motion: whether errors over the whole motion are wanted; all its steps must then be added.
     """
 

@@ -36,7 +36,8 @@ def contact_lost(
         eef_pos_w, target_pos_w: m. [..., E, 3]
         force: N. [..., E, 3]
         active: whether contact is intended. bool [..., E]
-        distance: m. min_force: N.
+        distance: m.
+        min_force: N.
         require: `either`: a contact is near and firm, and lost when it is far or loose; `both`: only when it is both.
 
     Returns:

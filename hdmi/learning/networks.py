@@ -18,7 +18,8 @@ class RunningNorm(nn.Module):
     """Normalises features by moments that `update` accumulates; gradients do not reach them.
 
     Args:
-        size: features. clip: bound of the normalised values.
+        size: features.
+        clip: bound of the normalised values.
     """
 
     def __init__(self, size: int, clip: float = 10.0):

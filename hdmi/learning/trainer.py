@@ -67,7 +67,8 @@ class Trainer:
             the task; without it there are none during training.
 
     Attributes:
-        actor: that acts in training. averaged: `averaged.module` is the policy that leaves it.
+        actor: that acts in training.
+        averaged: `averaged.module` is the policy that leaves it.
 
     Raises:
         CheckpointError: for a checkpoint that cannot be continued under this config; see `restore`.

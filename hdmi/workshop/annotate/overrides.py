@@ -29,7 +29,7 @@ from yaml import YAMLError
 
 from hdmi.motion.check import MotionError
 
-FILE = "annotation.yaml"
+FILE = "annotation.yaml"  # beside the motion
 _IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 Point = tuple[float, float, float]

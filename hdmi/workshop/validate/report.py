@@ -14,7 +14,7 @@ from rich.table import Table
 
 from hdmi.workshop.validate.limits import Limit
 
-Verdict = Literal["good", "usable", "bad"]
+Verdict = Literal["good", "usable", "bad"]  # of a check, and of a motion
 _ORDER: tuple[Verdict, ...] = ("good", "usable", "bad")
 _STYLE = {"good": "green", "usable": "yellow", "bad": "red"}
 
