@@ -19,7 +19,13 @@ CONF = next(path for path in (Path(__file__).parent / "conf", Path(__file__).par
 
 
 class ConfigError(ValueError):
-    """A config that cannot be built; the message names the node."""
+    """A config that cannot be built; the message names the node.
+
+    Examples:
+        >>> build({"_target_": "hdmi.assets.SimConfig", "step": 0.01}, "sim")
+        Traceback (most recent call last):
+        hdmi.config.ConfigError: sim: SimConfig has no ['step']; it takes ...
+    """
 
 
 def build(node: Any, where: str, **context: Any) -> Any:

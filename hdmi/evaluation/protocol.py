@@ -119,6 +119,12 @@ class EvalResult(Mapping[str, Any]):
     """What eval.json holds, as a mapping.
 
     Figures are `{"mean", "std"}` over environments, or None where nothing could be measured.
+
+    Examples:
+        >>> result = EvalResult({"task": "walk", "success": {"mean": 0.75, "std": 0.43}})
+        >>> result.save("eval.json")
+        >>> EvalResult.load("eval.json").figures()["success"]["mean"]
+        0.75
     """
 
     def __init__(self, values: Mapping[str, Any], path: Path | None = None):

@@ -10,7 +10,13 @@ from torch import Tensor
 
 
 def error_exceeds(error: Tensor, threshold: float) -> Tensor:
-    """Whether any of the errors is above the threshold. [..., K] -> bool [..., 1]"""
+    """Whether any of the errors is above the threshold. [..., K] -> bool [..., 1]
+
+    Examples:
+        >>> error_exceeds(torch.tensor([[0.1, 0.6], [0.1, 0.2]]), 0.5)
+        tensor([[ True],
+                [False]])
+    """
     return (error > threshold).any(-1, keepdim=True)
 
 
@@ -42,6 +48,14 @@ def contact_lost(
 
     Returns:
         bool [..., 1]
+
+    Examples:
+        >>> hand = torch.tensor([[0.3, 0.0, 0.0]])  # presses with 10 N, 30 cm off its contact point
+        >>> state = (hand, torch.zeros(1, 3), torch.tensor([[10.0, 0.0, 0.0]]), torch.tensor([True]))
+        >>> contact_lost(*state, distance=0.2, min_force=1.0)
+        tensor([True])
+        >>> contact_lost(*state, distance=0.2, min_force=1.0, require="both")
+        tensor([False])
     """
     far = (eef_pos_w - target_pos_w).norm(dim=-1) > distance
     loose = force.norm(dim=-1) < min_force
@@ -50,5 +64,11 @@ def contact_lost(
 
 
 def persist(condition: Tensor, count: Tensor) -> Tensor:
-    """Consecutive steps for which the condition has held. bool [..., 1], int [..., 1] -> int [..., 1]"""
+    """Consecutive steps for which the condition has held. bool [..., 1], int [..., 1] -> int [..., 1]
+
+    Examples:
+        >>> persist(torch.tensor([[True], [False]]), torch.tensor([[2], [2]]))
+        tensor([[3],
+                [0]])
+    """
     return (count + 1) * condition.to(count.dtype)

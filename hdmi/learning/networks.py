@@ -20,6 +20,13 @@ class RunningNorm(nn.Module):
     Args:
         size: features.
         clip: bound of the normalised values.
+
+    Examples:
+        >>> norm = RunningNorm(size=1)
+        >>> norm.update(mean=torch.tensor([3.0]), var=torch.tensor([3.9601]), n=100)  # of 1.99 squared
+        >>> norm(torch.tensor([[3.0], [5.0]]))  # (5 - 3) / (1.99 + 0.01)
+        tensor([[0.],
+                [1.]])
     """
 
     def __init__(self, size: int, clip: float = 10.0):

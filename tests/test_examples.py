@@ -1,0 +1,58 @@
+"""The examples in docstrings: every public class and every kernel has one, and each shows what it says."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import inspect
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from test_docs import public_names
+
+# packages whose classes have no examples yet
+COMING = ["hdmi.transforms"]
+
+# modules whose examples need an extra
+EXTRAS = {
+    "hdmi.workshop.author.solve": "mink",
+    "hdmi.workshop.ik": "mink",
+    "hdmi.workshop.retarget.measures": "mink",
+    "hdmi.workshop.view.browser": "viser",
+}
+
+OPTIONS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+
+
+def documented() -> dict[str, Any]:
+    """Public classes by name, kernels, and whatever else has an example."""
+    found = {}
+    for module, names in public_names().items():
+        if module in COMING:
+            continue
+        for name in names:
+            item = getattr(importlib.import_module(module), name)
+            kernel = module == "hdmi.functional"
+            if inspect.isclass(item) or kernel or (inspect.isfunction(item) and ">>>" in (item.__doc__ or "")):
+                found[f"{module}.{name}"] = item
+    return found
+
+
+@pytest.mark.parametrize("name", documented())
+def test_example(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs in an empty folder, with what the package exports, numpy as np and torch."""
+    item = documented()[name]
+    if extra := EXTRAS.get(item.__module__):
+        pytest.importorskip(extra)
+    monkeypatch.chdir(tmp_path)
+    package = importlib.import_module(name.rpartition(".")[0])
+    exported = getattr(package, "__all__", None) or [key for key in vars(package) if not key.startswith("_")]
+    names = {key: getattr(package, key) for key in exported} | {"np": np, "torch": torch}
+    example = doctest.DocTestParser().get_doctest(inspect.getdoc(item) or "", names, name, None, None)
+    assert example.examples, f"{name} has no example"
+    report: list[str] = []
+    doctest.DocTestRunner(optionflags=OPTIONS).run(example, out=report.append)
+    assert not report, "".join(report)
