@@ -120,6 +120,7 @@ class Scene:
 
     @property
     def num_object_joints(self) -> int:
+        """Joints of the object besides its root: 1 if it is articulated."""
         return 0 if self.object_hinge_qpos is None else 1
 
 

@@ -134,7 +134,7 @@ def feet_impact(force: Tensor, previous_force: Tensor, *, weight_force: float) -
 
     Examples:
         >>> before = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 300.0]])
-        >>> after = torch.tensor([[0.0, 0.0, 600.0], [0.0, 0.0, 0.0]])  # one lands with twice the weight, the other lifts off
+        >>> after = torch.tensor([[0.0, 0.0, 600.0], [0.0, 0.0, 0.0]])  # one lands at twice the weight, one lifts off
         >>> feet_impact(after, before, weight_force=300.0)
         tensor([4.])
     """

@@ -50,6 +50,7 @@ class RunningNorm(nn.Module):
         self.count.copy_(total)
 
     def forward(self, values: Tensor) -> Tensor:
+        """Normalised values, at most `clip`. [..., size] -> [..., size]"""
         scale = 1 / (self.var.sqrt() + 1e-2)
         # one pass over the batch instead of two
         return torch.addcmul(-self.mean * scale, values, scale).clamp(-self.clip, self.clip)

@@ -61,6 +61,7 @@ class Motion:
 
     @property
     def num_frames(self) -> int:
+        """T."""
         return len(self.joint_pos)
 
     def with_joints(self, names: Collection[str]) -> Motion:

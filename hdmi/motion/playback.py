@@ -55,10 +55,12 @@ class Playback:
 
     @property
     def fps(self) -> float:
+        """Frames per second."""
         return self.motion.fps
 
     @property
     def num_frames(self) -> int:
+        """T."""
         return len(self.qpos)
 
     def frames(self) -> Iterator[mujoco.MjData]:

@@ -55,10 +55,12 @@ class Reference:
 
     @property
     def num_frames(self) -> int:
+        """T."""
         return len(self.joint_pos)
 
     @property
     def has_object(self) -> bool:
+        """Whether it is not of a robot alone."""
         return self.object_pos.shape[-1] == 3
 
     def to(self, device: torch.device | str) -> Reference:

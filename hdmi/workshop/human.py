@@ -111,6 +111,7 @@ class HumanMotion:
 
     @property
     def num_frames(self) -> int:
+        """T."""
         return len(self.joint_pos)
 
     def index(self, joint: str) -> int:

@@ -70,6 +70,7 @@ class Skeleton:
     height: float  # m
 
     def index(self, joint: str) -> int:
+        """Number of a joint."""
         return self.joint_names.index(joint)
 
     def forward(self, rotation: np.ndarray, root_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -47,6 +47,7 @@ class RetargetReport:
         return asdict(self)
 
     def to_json(self) -> str:
+        """Those values as json."""
         return json.dumps(self.as_dict(), indent=1) + "\n"
 
     def table(self) -> RenderableType:

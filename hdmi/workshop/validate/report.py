@@ -110,6 +110,7 @@ class Report:
 
     @property
     def verdict(self) -> Verdict:
+        """The worst of the findings'."""
         return _ORDER[max((_ORDER.index(finding.verdict) for finding in self.findings), default=0)]
 
     @property
@@ -134,6 +135,7 @@ class Report:
         }
 
     def to_json(self) -> str:
+        """Those values as JSON."""
         return json.dumps(self.as_dict(), indent=1, allow_nan=False)
 
     def table(self) -> Table:
