@@ -33,6 +33,8 @@ class Comments(griffe.Extension):
         first = row
         while attr.parent.is_module and lines[first - 1].startswith("# "):
             first -= 1
+        if not lines[row].lstrip().startswith(attr.name):  # `self.name = ...`
+            return
         behind = _COMMENT.fullmatch(lines[row])
         comment = [behind[1]] if behind else [line[2:] for line in lines[first:row]]
         if comment:

@@ -37,6 +37,11 @@ def tracking_mean(*errors: Tensor, sigmas: Sequence[float], tolerances: Sequence
 
     Returns:
         Reward in (0, 1]. [..., 1]
+
+    Examples:
+        >>> near, far = torch.tensor([0.0, 0.0]), torch.tensor([0.2])
+        >>> tracking_mean(near, far, sigmas=[0.1, 0.2], tolerances=[0.0, 0.0])  # (1 + exp(-1)) / 2
+        tensor([0.6839])
     """
     kernels = [tracking(e, sigma=s, tolerance=t) for e, s, t in zip(errors, sigmas, tolerances, strict=True)]
     return torch.stack(kernels).mean(0)
@@ -90,12 +95,23 @@ def interaction(
 
 
 def alive(terminated: Tensor) -> Tensor:
-    """One in every step that does not terminate. bool [..., 1] -> [..., 1]"""
+    """One in every step that does not terminate. bool [..., 1] -> [..., 1]
+
+    Examples:
+        >>> alive(torch.tensor([[True], [False]]))
+        tensor([[0.],
+                [1.]])
+    """
     return (~terminated).float()
 
 
 def sum_of_squares(value: Tensor) -> Tensor:
-    """[..., J] -> [..., 1]"""
+    """Squares, summed over joints. [..., J] -> [..., 1]
+
+    Examples:
+        >>> sum_of_squares(torch.tensor([1.0, 2.0]))
+        tensor([5.])
+    """
     return value.square().sum(-1, keepdim=True)
 
 

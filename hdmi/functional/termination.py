@@ -21,7 +21,12 @@ def error_exceeds(error: Tensor, threshold: float) -> Tensor:
 
 
 def any_error_exceeds(*errors: Tensor, thresholds: Sequence[float]) -> Tensor:
-    """Whether any of several errors is above its threshold. [..., K] each -> bool [..., 1]"""
+    """Whether any of several errors is above its threshold. [..., K] each -> bool [..., 1]
+
+    Examples:
+        >>> any_error_exceeds(torch.tensor([0.1, 0.2]), torch.tensor([0.6]), thresholds=[0.5, 0.5])
+        tensor([True])
+    """
     exceeded = [error_exceeds(error, threshold) for error, threshold in zip(errors, thresholds, strict=True)]
     return torch.stack(exceeded).any(0)
 
