@@ -65,9 +65,9 @@ class Effector:
         >>> ball = ObjectConfig("ball", geoms=[{"sphere": 0.2}])
         >>> build_scene(RobotConfig(), SimConfig(), ball, effectors=[palm]).effector_sensors.shape
         (1, 3)
-        >>> Effector("left_hand").check("effectors[0]")
+        >>> build_scene(RobotConfig(), SimConfig(), ball, effectors=[Effector("left_hand")])
         Traceback (most recent call last):
-        ValueError: effectors[0].body: robot has no body 'left_hand'; it has pelvis, ...
+        ValueError: effectors: robot has no body 'left_hand'; it has ['pelvis', ...
     """
 
     body: str
