@@ -15,7 +15,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install format lint test train clean
+.PHONY: help install format lint test docs train clean
 
 help: ## list the verbs
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -26,7 +26,7 @@ install: $(STAMP) ## create .venv and install the package with its tools
 $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -c constraints.txt '$(TORCH)'
-	$(BIN)/python -m pip install -c constraints.txt -e '.[dev,retarget,viewer,gpu,ray,cluster]'
+	$(BIN)/python -m pip install -c constraints.txt -e '.[dev,docs,retarget,viewer,gpu,ray,cluster]'
 	touch $@
 
 format: $(STAMP) ## format the code and fix what ruff can fix
@@ -40,6 +40,9 @@ lint: $(STAMP) ## check style, formatting and types
 
 test: $(STAMP) ## run the tests; HDMI_MOTIONS=FOLDER adds those on the public motions, ARGS='-m slow' runs the slow ones
 	$(BIN)/python -m pytest -n 2 --dist loadgroup $(ARGS)
+
+docs: $(STAMP) ## build the documentation into build/docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 train: $(STAMP) ## train with the default configuration; ARGS='key=value ...' overrides it
 	$(BIN)/python train.py $(ARGS)

@@ -47,7 +47,14 @@ OUTPUTS = (
 
 @dataclass(frozen=True)
 class Task:
-    """What a config's task, robot and sim nodes describe."""
+    """What a config's task, robot and sim nodes describe.
+
+    Examples:
+        >>> from hdmi.config import task_config
+        >>> task = make_task(task_config("lift_box"))
+        >>> task.name, task.reference.num_frames, len(task.scene.effectors)
+        ('lift_box', 300, 2)
+    """
 
     name: str
     scene: Scene

@@ -19,7 +19,13 @@ CONF = next(path for path in (Path(__file__).parent / "conf", Path(__file__).par
 
 
 class ConfigError(ValueError):
-    """A config that cannot be built; the message names the node."""
+    """A config that cannot be built; the message names the node.
+
+    Examples:
+        >>> build({"_target_": "hdmi.assets.SimConfig", "step": 0.01}, "sim")
+        Traceback (most recent call last):
+        hdmi.config.ConfigError: sim: SimConfig has no ['step']; it takes ...
+    """
 
 
 def build(node: Any, where: str, **context: Any) -> Any:
@@ -66,11 +72,17 @@ def _plain(value: Any, where: str) -> Any:
 
 
 def plain_container(node: Any) -> dict[str, Any]:
+    """A config node as plain values, interpolations resolved."""
     values: Any = OmegaConf.to_container(node, resolve=True)
     return values
 
 
 def build_dataclass(cls: type, node: Any, where: str) -> Any:
+    """A dataclass from a config node, or from a mapping, of its fields.
+
+    Raises:
+        ConfigError: for a field that it lacks, or values that it refuses; names the node.
+    """
     values = plain_container(node) if OmegaConf.is_config(node) else node
     names = {f.name for f in fields(cls)}
     if unknown := set(values) - names:
@@ -101,6 +113,7 @@ def task_node(cfg: DictConfig, where: str) -> Any:
 
 
 def one_line(error: Exception) -> str:
+    """The message of an error on one line."""
     return " ".join(str(error).split())
 
 

@@ -28,6 +28,14 @@ class GeomConfig:
         pos, quat: of the geom in the body frame, m and wxyz.
         body_quat: rotates pos and quat about the body's origin (for a body frame that is tilted in the source).
         rgba: colour; the object's if absent.
+
+    Examples:
+        >>> lid = GeomConfig(box=(0.2, 0.3, 0.01), pos=(0.0, 0.0, 0.2))
+        >>> parse_geom({"box": (0.2, 0.3, 0.01), "pos": (0.0, 0.0, 0.2)}, "geoms[0]") == lid
+        True
+        >>> parse_geom(GeomConfig(sphere=-0.1), "geoms[1]")
+        Traceback (most recent call last):
+        ValueError: geoms[1].sphere: 1 positive number expected, got -0.1
     """
 
     box: Sequence[float] | None = None
@@ -52,7 +60,14 @@ class HingeConfig:
         geoms: of the link, in its frame.
         pos, quat: of the link in the base frame; the hinge passes through its origin.
         axis, range: of the hinge, in the link frame, rad.
-        friction: dry friction, N m. damping: N m s/rad.
+        friction: dry friction, N m.
+        damping: N m s/rad.
+
+    Examples:
+        >>> panel = HingeConfig(name="door_joint", body="panel", geoms=[{"box": (0.02, 0.45, 1.0)}], range=(0.0, 1.5))
+        >>> door = ObjectConfig("door", geoms=[{"box": (0.05, 0.05, 1.0)}], hinge=panel, fixed_base=True)
+        >>> build_scene(RobotConfig(), SimConfig(), door).num_object_joints
+        1
     """
 
     name: str
@@ -93,6 +108,12 @@ class ObjectConfig:
         hinge: the link of an articulated object.
         fixed_base: static in the world at the reference's first pose.
         rgba: colour.
+
+    Examples:
+        >>> box = ObjectConfig("box", geoms=[{"box": (0.1, 0.1, 0.1)}, {"box": (0.1, 0.1, 0.2)}], mass=3.0)
+        >>> scene = build_scene(RobotConfig(), SimConfig(), box)
+        >>> float(scene.model.body("box").mass[0])
+        3.0
     """
 
     name: str
@@ -137,6 +158,12 @@ class SceneryConfig:
     Args:
         friction: sliding friction. MuJoCo takes the larger one of a pair, so the least there is
             leaves it to what touches the body.
+
+    Examples:
+        >>> stand = SceneryConfig("stand", geoms=[{"cylinder": (0.2, 0.3)}], pos=(0.5, 0.0, 0.3))
+        >>> scene = build_scene(RobotConfig(), SimConfig(), scenery=[stand])
+        >>> scene.model.body("stand").pos.tolist()
+        [0.5, 0.0, 0.3]
     """
 
     name: str

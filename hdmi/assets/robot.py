@@ -69,6 +69,13 @@ class RobotConfig:
             `hdmi.motion.make_reference`.
         friction: sliding friction of all robot geoms.
         mesh_dir: folder with Unitree's `<body>.STL` files; used as visuals instead of primitives.
+
+    Examples:
+        >>> crouched = RobotConfig(feet="box", default_pose={".*_knee_joint": 1.0})
+        >>> float(crouched.default_joint_pos[g1.JOINT_NAMES.index("left_knee_joint")])
+        1.0
+        >>> build_scene(crouched, SimConfig()).model.nu
+        29
     """
 
     feet: Literal["sphere", "box"] = "sphere"

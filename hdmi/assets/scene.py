@@ -27,6 +27,12 @@ class SimConfig:
         integrator, cone: MuJoCo's; Euler treats joint damping implicitly.
         impratio: of frictional to normal contact stiffness, for elliptic cones: above 1, what is held creeps less.
         iterations, ls_iterations: of the constraint solver.
+
+    Examples:
+        >>> SimConfig(timestep=0.005, decimation=4).control_dt
+        0.02
+        >>> build_scene(RobotConfig(), SimConfig(iterations=50)).model.opt.iterations
+        50
     """
 
     timestep: float = 0.005
@@ -53,6 +59,15 @@ class Effector:
         target: on the object's link, in its frame, m; the reference motion's contact points take precedence.
         press: how far into the object the contact point is moved along the surface's normal, m: what rewards,
             terminations and observations see. On the surface it asks for a touch, deeper for a grip.
+
+    Examples:
+        >>> palm = Effector("left_wrist_yaw_link", point=(0.1, 0.0, 0.0), target=(0.0, 0.2, 0.0))
+        >>> ball = ObjectConfig("ball", geoms=[{"sphere": 0.2}])
+        >>> build_scene(RobotConfig(), SimConfig(), ball, effectors=[palm]).effector_sensors.shape
+        (1, 3)
+        >>> build_scene(RobotConfig(), SimConfig(), ball, effectors=[Effector("left_hand")])
+        Traceback (most recent call last):
+        ValueError: effectors: robot has no body 'left_hand'; it has ['pelvis', ...
     """
 
     body: str
@@ -73,7 +88,15 @@ class Effector:
 
 @dataclass(frozen=True)
 class Scene:
-    """A compiled scene and where its parts are in MuJoCo's arrays."""
+    """A compiled scene and where its parts are in MuJoCo's arrays.
+
+    Examples:
+        >>> scene = build_scene(RobotConfig(), SimConfig())
+        >>> scene.default_qpos.shape, scene.object_body  # a free root and 29 joints; no object
+        ((36,), None)
+        >>> scene.default_qpos[scene.joint_qpos].shape
+        (29,)
+    """
 
     model: mujoco.MjModel
     xml: str  # MJCF of the model, for other programs
@@ -97,6 +120,7 @@ class Scene:
 
     @property
     def num_object_joints(self) -> int:
+        """Joints of the object besides its root: 1 if it is articulated."""
         return 0 if self.object_hinge_qpos is None else 1
 
 

@@ -19,7 +19,14 @@ _STEP = 1e-5  # m; of the numerical gradient
 
 @dataclass(frozen=True)
 class Surface:
-    """The surface of one body of an object: the union of its geoms, in the body's frame."""
+    """The surface of one body of an object: the union of its geoms, in the body's frame.
+
+    Examples:
+        >>> from hdmi.assets import ObjectConfig
+        >>> ball = object_surfaces(ObjectConfig("ball", geoms=[{"sphere": 0.5}]))["ball"]
+        >>> ball.distance(np.array([[2.0, 0.0, 0.0], [0.0, 0.0, 0.25]]))
+        array([ 1.5 , -0.25])
+    """
 
     geoms: Sequence[GeomConfig]
 

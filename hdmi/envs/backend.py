@@ -24,6 +24,14 @@ class PhysicsBackend(Protocol):
         num_worlds: N.
         device: of all tensors.
         masked: whether worlds are better chosen by masks: a host that asks for numbers would wait for the device.
+
+    Examples:
+        >>> from hdmi.assets import RobotConfig, SimConfig, build_scene
+        >>> scene = build_scene(RobotConfig(), SimConfig())
+        >>> backend: PhysicsBackend = BatchBackend(scene.model, num_worlds=2, num_threads=1)
+        >>> backend.data("qpos")[1, 2] = torch.nan
+        >>> backend.failed()
+        tensor([False,  True])
     """
 
     num_worlds: int
@@ -149,6 +157,14 @@ class BatchBackend(LiveBackend):
 
     Args:
         num_threads: 0 for all processors.
+
+    Examples:
+        >>> from hdmi.assets import RobotConfig, SimConfig, build_scene
+        >>> scene = build_scene(RobotConfig(), SimConfig(timestep=0.005, decimation=4))
+        >>> backend = BatchBackend(scene.model, num_worlds=2, num_threads=1)
+        >>> backend.step(torch.zeros(2, 4, 29))  # one target per physics step
+        >>> backend.data("time").flatten()
+        tensor([0.0200, 0.0200], dtype=torch.float64)
     """
 
     masked = False

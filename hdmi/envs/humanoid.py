@@ -54,6 +54,14 @@ class HumanoidObjectEnv(EnvBase):
         num_envs: N.
         backend: makes a physics backend from a model and N; MuJoCo's CPU `Batch` by default.
         pixels: (height, width) to add rendered `pixels`.
+
+    Examples:
+        >>> from hdmi.assets import RobotConfig, SimConfig, build_scene
+        >>> env = HumanoidObjectEnv(build_scene(RobotConfig(), SimConfig()), num_envs=2)
+        >>> td = env.reset()
+        >>> td["action"] = td["robot", "joint_pos"]  # servos hold the pose
+        >>> env.step(td)["next", "robot", "body_pos"].shape
+        torch.Size([2, 30, 3])
     """
 
     batch_locked = True

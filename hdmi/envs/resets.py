@@ -34,7 +34,16 @@ class RowResetEnv(TransformedEnv):
 
     Args:
         env, transform: as for `TransformedEnv`.
-        max_penetration: m. redraws: at most; with 0 every start is taken as it comes.
+        max_penetration: m.
+        redraws: at most; with 0 every start is taken as it comes.
+
+    Examples:
+        >>> from torchrl.envs import Compose, StepCounter
+        >>> from hdmi.assets import RobotConfig, SimConfig, build_scene
+        >>> base = HumanoidObjectEnv(build_scene(RobotConfig(), SimConfig()), num_envs=2)
+        >>> env = RowResetEnv(base, Compose(StepCounter(max_steps=2)))
+        >>> env.rollout(4, break_when_any_done=False)["next", "step_count"][0].flatten().tolist()
+        [1, 2, 1, 2]
     """
 
     def __init__(self, env: EnvBase, transform: Transform, *, max_penetration: float = 0.02, redraws: int = 0):
@@ -163,6 +172,14 @@ class MaskedResetEnv(RowResetEnv):
     How many environments are done is known on the device only. The stack therefore computes a reset of all of them in
     every step, in tensors of fixed size, and a mask says whose results count. On a CPU, where asking costs nothing,
     steps in which nobody is done are left alone.
+
+    Examples:
+        >>> from torchrl.envs import Compose, StepCounter
+        >>> from hdmi.assets import RobotConfig, SimConfig, build_scene
+        >>> base = HumanoidObjectEnv(build_scene(RobotConfig(), SimConfig()), num_envs=2)
+        >>> env = MaskedResetEnv(base, Compose(StepCounter(max_steps=2)))
+        >>> env.rollout(4, break_when_any_done=False)["next", "step_count"][0].flatten().tolist()
+        [1, 2, 1, 2]
     """
 
     def compile_transforms(self, **options: Any) -> None:

@@ -119,6 +119,12 @@ class EvalResult(Mapping[str, Any]):
     """What eval.json holds, as a mapping.
 
     Figures are `{"mean", "std"}` over environments, or None where nothing could be measured.
+
+    Examples:
+        >>> result = EvalResult({"task": "walk", "success": {"mean": 0.75, "std": 0.43}})
+        >>> result.save("eval.json")
+        >>> EvalResult.load("eval.json").figures()["success"]["mean"]
+        0.75
     """
 
     def __init__(self, values: Mapping[str, Any], path: Path | None = None):
@@ -189,7 +195,9 @@ class FirstEpisodes:
     there on the last ones count.
 
     Args:
-        num_envs: environments. horizon: steps of a full episode. causes: termination names, the first has precedence.
+        num_envs: environments.
+        horizon: steps of a full episode.
+        causes: termination names, the first has precedence.
         whole_motion: whether errors over the whole motion are wanted; all its steps must then be added.
     """
 

@@ -46,7 +46,15 @@ _FRAME_WIDTH = 6  # pixels of the red frame after a failure
 
 
 class RenderingError(RuntimeError):
-    """Nothing can be drawn here; the message says what to install or set."""
+    """Nothing can be drawn here; the message says what to install or set.
+
+    Examples:
+        >>> try:
+        ...     raise RenderingError("window=true needs a display")  # as `render_checkpoint` does without OpenGL
+        ... except RuntimeError as error:
+        ...     print(error)
+        window=true needs a display
+    """
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,13 @@ def local_pose(
 
     Returns:
         Positions [..., K, 3] and orientations [..., K, 4] in that frame.
+
+    Examples:
+        >>> facing_y = quat_from_euler(torch.tensor([0.0, 0.0, torch.pi / 2]))
+        >>> ahead = torch.tensor([[1.0, 3.0, 0.5]])  # 2 m in front of a root at (1, 1), 0.5 m above the ground
+        >>> pos, quat = local_pose(ahead, facing_y[None], torch.tensor([1.0, 1.0, 0.8]), facing_y)
+        >>> pos.round(decimals=3).abs(), quat.round(decimals=3)
+        (tensor([[2.0000, 0.0000, 0.5000]]), tensor([[1., 0., 0., 0.]]))
     """
     # The frame is turned about z only, which leaves a plane rotation and half of the quaternion product.
     cos_half, _, _, sin_half = yaw_quat(root_quat_w).unsqueeze(-2).unbind(-1)  # [..., 1]
@@ -51,6 +58,12 @@ def body_velocity(cvel: Tensor, pos_w: Tensor, com_w: Tensor) -> tuple[Tensor, T
 
     Returns:
         Linear (m/s) and angular (rad/s) velocities. [..., B, 3] each
+
+    Examples:
+        >>> cvel = torch.tensor([[0.0, 0.0, 2.0, 1.0, 0.0, 0.0]])  # 2 rad/s about z, 1 m/s along x
+        >>> lin, ang = body_velocity(cvel, torch.tensor([[0.0, 1.0, 0.0]]), torch.zeros(1, 3))
+        >>> lin, ang
+        (tensor([[-1.,  0.,  0.]]), tensor([[0., 0., 2.]]))
     """
     ang = cvel[..., :3]
     lin = cvel[..., 3:] + torch.linalg.cross(ang, pos_w - com_w)

@@ -19,6 +19,12 @@ def tracking(error: Tensor, *, sigma: float, tolerance: float = 0.0) -> Tensor:
 
     Returns:
         Reward in (0, 1]. [..., 1]
+
+    Examples:
+        >>> tracking(torch.tensor([0.1, 0.3]), sigma=0.2)  # exp(-1)
+        tensor([0.3679])
+        >>> tracking(torch.tensor([0.1, 0.3]), sigma=0.2, tolerance=0.2)
+        tensor([1.])
     """
     return torch.exp(-(error.mean(-1, keepdim=True) - tolerance).clamp(min=0) / sigma)
 
@@ -31,6 +37,11 @@ def tracking_mean(*errors: Tensor, sigmas: Sequence[float], tolerances: Sequence
 
     Returns:
         Reward in (0, 1]. [..., 1]
+
+    Examples:
+        >>> near, far = torch.tensor([0.0, 0.0]), torch.tensor([0.2])
+        >>> tracking_mean(near, far, sigmas=[0.1, 0.2], tolerances=[0.0, 0.0])  # (1 + exp(-1)) / 2
+        tensor([0.6839])
     """
     kernels = [tracking(e, sigma=s, tolerance=t) for e, s, t in zip(errors, sigmas, tolerances, strict=True)]
     return torch.stack(kernels).mean(0)
@@ -63,6 +74,15 @@ def interaction(
 
     Returns:
         Reward in [0, 1]. [..., 1]
+
+    Examples:
+        >>> hands = torch.tensor([[0.0, 0.1, 0.0], [0.0, 0.0, 0.0]])  # the first is 10 cm off, the second at its point
+        >>> force = torch.tensor([[0.0, 8.0, 0.0], [0.0, 0.0, 0.0]])  # but does not press
+        >>> sigmas = {"sigma_pos": 0.1, "sigma_frc": 5.0, "force_threshold": 5.0}
+        >>> interaction(hands, torch.zeros(2, 3), force, torch.tensor([True, False]), **sigmas)  # exp(-0.1 / 0.1)
+        tensor([0.3679])
+        >>> interaction(hands, torch.zeros(2, 3), force, torch.tensor([False, True]), **sigmas)  # exp((0 - 5) / 5)
+        tensor([0.3679])
     """
     distance = ((eef_pos_w - target_pos_w).norm(dim=-1) - tolerance).clamp(min=0)  # [..., E]
     proximity = torch.exp(-distance / sigma_pos)
@@ -75,22 +95,44 @@ def interaction(
 
 
 def alive(terminated: Tensor) -> Tensor:
-    """One in every step that does not terminate. bool [..., 1] -> [..., 1]"""
+    """One in every step that does not terminate. bool [..., 1] -> [..., 1]
+
+    Examples:
+        >>> alive(torch.tensor([[True], [False]]))
+        tensor([[0.],
+                [1.]])
+    """
     return (~terminated).float()
 
 
 def sum_of_squares(value: Tensor) -> Tensor:
-    """[..., J] -> [..., 1]"""
+    """Squares, summed over joints. [..., J] -> [..., 1]
+
+    Examples:
+        >>> sum_of_squares(torch.tensor([1.0, 2.0]))
+        tensor([5.])
+    """
     return value.square().sum(-1, keepdim=True)
 
 
 def action_rate(action: Tensor, previous: Tensor) -> Tensor:
-    """Squared change of the action between control steps. [..., A], [..., A] -> [..., 1]"""
+    """Squared change of the action between control steps. [..., A], [..., A] -> [..., 1]
+
+    Examples:
+        >>> action_rate(torch.tensor([1.0, 2.0]), torch.tensor([0.0, 0.0]))
+        tensor([5.])
+    """
     return (action - previous).square().sum(-1, keepdim=True)
 
 
 def limit_excess(value: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """L1 distance outside of [low, high], summed over joints. [..., J] -> [..., 1]"""
+    """L1 distance outside of [low, high], summed over joints. [..., J] -> [..., 1]
+
+    Examples:
+        >>> low, high = torch.full((3,), -1.0), torch.full((3,), 1.0)
+        >>> limit_excess(torch.tensor([-1.5, 0.2, 2.0]), low, high)
+        tensor([1.5000])
+    """
     return ((low - value).clamp(min=0) + (value - high).clamp(min=0)).sum(-1, keepdim=True)
 
 
@@ -105,13 +147,26 @@ def feet_impact(force: Tensor, previous_force: Tensor, *, weight_force: float) -
 
     Returns:
         [..., 1]
+
+    Examples:
+        >>> before = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 300.0]])
+        >>> after = torch.tensor([[0.0, 0.0, 600.0], [0.0, 0.0, 0.0]])  # one lands at twice the weight, one lifts off
+        >>> feet_impact(after, before, weight_force=300.0)
+        tensor([4.])
     """
     rise = (force.norm(dim=-1) - previous_force.norm(dim=-1)).clamp(min=0) / weight_force
     return rise.square().sum(-1, keepdim=True)
 
 
 def feet_slip(foot_lin_vel_w: Tensor, force: Tensor, *, force_threshold: float) -> Tensor:
-    """Horizontal speed of the feet that carry load, m/s summed over feet. [..., 2, 3], [..., 2, 3] -> [..., 1]"""
+    """Horizontal speed of the feet that carry load, m/s summed over feet. [..., 2, 3], [..., 2, 3] -> [..., 1]
+
+    Examples:
+        >>> velocity = torch.tensor([[0.3, 0.4, 0.0], [1.0, 0.0, 0.0]])
+        >>> force = torch.tensor([[0.0, 0.0, 200.0], [0.0, 0.0, 0.0]])  # the second foot is in the air
+        >>> feet_slip(velocity, force, force_threshold=1.0)
+        tensor([0.5000])
+    """
     loaded = force.norm(dim=-1) > force_threshold
     return (foot_lin_vel_w[..., :2].norm(dim=-1) * loaded).sum(-1, keepdim=True)
 
@@ -125,6 +180,10 @@ def feet_stumble(force: Tensor, *, ratio: float) -> Tensor:
 
     Returns:
         [..., 1]
+
+    Examples:
+        >>> feet_stumble(torch.tensor([[50.0, 0.0, 10.0], [20.0, 0.0, 100.0]]), ratio=4.0)
+        tensor([1.])
     """
     stumbles = force[..., :2].norm(dim=-1) > ratio * force[..., 2].abs()
     return stumbles.sum(-1, keepdim=True).to(force.dtype)
@@ -139,5 +198,9 @@ def feet_air_time(air_time: Tensor, touchdown: Tensor, *, threshold: float) -> T
 
     Returns:
         s. [..., 1]
+
+    Examples:
+        >>> feet_air_time(torch.tensor([0.25, 0.1]), torch.tensor([True, False]), threshold=0.5)
+        tensor([0.2500])
     """
     return ((threshold - air_time).clamp(min=0) * touchdown).sum(-1, keepdim=True)

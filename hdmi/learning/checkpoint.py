@@ -16,7 +16,13 @@ POLICY_FILE = "policy.pt"  # of an exported policy
 
 
 class CheckpointError(RuntimeError):
-    """A checkpoint that cannot be used; the message names file and cause."""
+    """A checkpoint that cannot be used; the message names file and cause.
+
+    Examples:
+        >>> load_checkpoint("runs/nowhere")
+        Traceback (most recent call last):
+        hdmi.learning.checkpoint.CheckpointError: ...
+    """
 
 
 @contextmanager

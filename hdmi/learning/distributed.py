@@ -16,7 +16,9 @@ class Ranks:
     """This process among those that train together; alone, its methods return what they are given.
 
     Args:
-        rank: of this process. size: number of processes. local_rank, local_size: the same on this machine.
+        rank: of this process.
+        size: number of processes.
+        local_rank, local_size: the same on this machine.
     """
 
     rank: int = 0

@@ -18,7 +18,15 @@ class RunningNorm(nn.Module):
     """Normalises features by moments that `update` accumulates; gradients do not reach them.
 
     Args:
-        size: features. clip: bound of the normalised values.
+        size: features.
+        clip: bound of the normalised values.
+
+    Examples:
+        >>> norm = RunningNorm(size=1)
+        >>> norm.update(mean=torch.tensor([3.0]), var=torch.tensor([3.9601]), n=100)  # of 1.99 squared
+        >>> norm(torch.tensor([[3.0], [5.0]]))  # (5 - 3) / (1.99 + 0.01)
+        tensor([[0.],
+                [1.]])
     """
 
     def __init__(self, size: int, clip: float = 10.0):
@@ -42,6 +50,7 @@ class RunningNorm(nn.Module):
         self.count.copy_(total)
 
     def forward(self, values: Tensor) -> Tensor:
+        """Normalised values, at most `clip`. [..., size] -> [..., size]"""
         scale = 1 / (self.var.sqrt() + 1e-2)
         # one pass over the batch instead of two
         return torch.addcmul(-self.mean * scale, values, scale).clamp(-self.clip, self.clip)

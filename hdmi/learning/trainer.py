@@ -67,11 +67,24 @@ class Trainer:
             the task; without it there are none during training.
 
     Attributes:
-        actor: that acts in training. averaged: `averaged.module` is the policy that leaves it.
+        actor: that acts in training.
+        averaged: `averaged.module` is the policy that leaves it.
 
     Raises:
         CheckpointError: for a checkpoint that cannot be continued under this config; see `restore`.
         ConfigError, MotionError: for a config that cannot be built.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from hdmi.config import task_config
+        >>> cfg = task_config("walk")
+        >>> cfg.merge_with({"num_envs": 2, "num_threads": 1, "total_frames": 16, "logger": {"wandb": None}})
+        >>> cfg.algo.merge_with({"frames_per_env": 8, "minibatches": 1, "actor_hidden": [8], "critic_hidden": [8]})
+        >>> trainer = Trainer(cfg, Path("run"))
+        >>> trainer.run()
+        1/1 reward ... steps/s
+        >>> trainer.frames
+        16
     """
 
     def __init__(self, cfg: DictConfig, folder: Path, evaluate: Evaluate | None = None):

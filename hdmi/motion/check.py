@@ -8,7 +8,13 @@ import numpy as np
 
 
 class MotionError(ValueError):
-    """A motion file that cannot be used; the message names file, field and frame."""
+    """A motion file that cannot be used; the message names file, field and frame.
+
+    Examples:
+        >>> load_motion("motions/nowhere")
+        Traceback (most recent call last):
+        hdmi.motion.check.MotionError: motions/nowhere/meta.json: ...
+    """
 
 
 def checked(where: object, key: str, array: np.ndarray, shape: tuple[int, ...], because: str = "") -> np.ndarray:

@@ -34,7 +34,17 @@ from hdmi.motion.kinematics import angular_velocity, derivative
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion of named bodies and joints, sampled at `fps`. Arrays as in the file format, float32."""
+    """A motion of named bodies and joints, sampled at `fps`. Arrays as in the file format, float32.
+
+    Examples:
+        >>> motion = load_motion(find_motion("lift_box"))
+        >>> motion.num_frames, motion.fps, motion.joint_pos.shape
+        (300, 50.0, (300, 29))
+        >>> motion.with_joints(["left_knee_joint"]).joint_pos.shape
+        (300, 1)
+        >>> load_motion(save_motion(motion, "copy/lift_box")).body_names == motion.body_names
+        True
+    """
 
     name: str
     fps: float
@@ -51,6 +61,7 @@ class Motion:
 
     @property
     def num_frames(self) -> int:
+        """T."""
         return len(self.joint_pos)
 
     def with_joints(self, names: Collection[str]) -> Motion:

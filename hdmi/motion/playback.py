@@ -38,6 +38,14 @@ class Playback:
 
     Geoms are told apart by what they belong to: the robot's collision shapes, the object, and the ground (the floor
     and all scenery).
+
+    Examples:
+        >>> playback = make_playback(load_motion(find_motion("walk")))
+        >>> playback.qpos.shape
+        (550, 36)
+        >>> pos, mat = playback.body_poses("pelvis")
+        >>> pos.shape, mat.shape
+        ((550, 3), (550, 3, 3))
     """
 
     motion: Motion
@@ -47,10 +55,12 @@ class Playback:
 
     @property
     def fps(self) -> float:
+        """Frames per second."""
         return self.motion.fps
 
     @property
     def num_frames(self) -> int:
+        """T."""
         return len(self.qpos)
 
     def frames(self) -> Iterator[mujoco.MjData]:

@@ -29,6 +29,11 @@ class Reference:
 
     Float32 tensors, world frame, T frames at the control rate; E is 0 and the object fields are empty for a
     robot-only motion, K is 0 for a rigid object.
+
+    Examples:
+        >>> reference = make_reference(find_motion("walk"), control_dt=0.02)
+        >>> reference.num_frames, reference.has_object, reference.joint_pos.shape
+        (550, False, torch.Size([550, 29]))
     """
 
     name: str
@@ -50,10 +55,12 @@ class Reference:
 
     @property
     def num_frames(self) -> int:
+        """T."""
         return len(self.joint_pos)
 
     @property
     def has_object(self) -> bool:
+        """Whether it is not of a robot alone."""
         return self.object_pos.shape[-1] == 3
 
     def to(self, device: torch.device | str) -> Reference:

@@ -46,6 +46,12 @@ class Contact:
         distance: from its point to the contact point, in each labelled frame, m. [F]
         gap: between its collision shapes and the object's, in each labelled frame, m; negative inside, at most
             `hdmi.motion.playback.FAR`. [F]
+
+    Examples:
+        >>> from hdmi.config import task_config
+        >>> left, right = measure_contacts(task_config("lift_box"))
+        >>> left.effector, bool(left.gap.max() < 0.01)  # m
+        ('left_wrist_yaw_link', True)
     """
 
     effector: str
@@ -80,6 +86,10 @@ class Training:
 
     Args:
         before, after: sum of rewards over the first steps of each episode. [N]
+
+    Examples:
+        >>> Training(before=np.array([1.0, 2.0, 3.0]), after=np.array([2.0, 4.0, 6.0])).gain
+        (2.0, 2.0)
     """
 
     before: np.ndarray
@@ -102,7 +112,14 @@ class Training:
 
 @dataclass
 class TaskCheck:
-    """What the smoke test of one task found; `problems` is empty if it passed."""
+    """What the smoke test of one task found; `problems` is empty if it passed.
+
+    Examples:
+        >>> check = TaskCheck("walk")
+        >>> check.problems.append("reference: ...")
+        >>> len(check.problems)
+        1
+    """
 
     name: str
     contacts: list[Contact] = field(default_factory=list)

@@ -1,4 +1,18 @@
-"""TorchRL transforms for co-tracking a robot-and-object reference: each reads and writes keys, none knows another."""
+"""TorchRL transforms for co-tracking a robot-and-object reference: each reads and writes keys, none knows another.
+
+Most of them take a TensorDict; those that carry state work in an environment only.
+
+Examples:
+    What the classes' examples go on from.
+
+    >>> from torchrl.envs import Compose, TransformedEnv
+    >>> from hdmi.assets import RobotConfig, SimConfig, build_scene, g1
+    >>> from hdmi.envs import HumanoidObjectEnv
+    >>> from hdmi.motion import find_motion, make_reference
+    >>> scene = build_scene(RobotConfig(), SimConfig())
+    >>> base = HumanoidObjectEnv(scene, num_envs=2)
+    >>> reference = make_reference(find_motion("walk"), control_dt=0.02)  # 550 frames
+"""
 
 from hdmi.transforms.action import (
     ActionDelay,

@@ -71,6 +71,11 @@ class JointPositionAction(_ActionTransform):
     Args:
         scale: joint name pattern -> rad per unit of action; joints that match none are not actuated by the policy.
         joint_names: of the J joints.
+
+    Examples:
+        >>> action = JointPositionAction({".*_knee": 0.5}, joint_names=["hip", "left_knee", "right_knee"])
+        >>> action.inv(TensorDict({"action": torch.tensor([[1.0, -1.0]])}, [1]))["action"]
+        tensor([[ 0.0000,  0.5000, -0.5000]])
     """
 
     def __init__(
@@ -116,6 +121,11 @@ class ResidualAction(_ActionTransform):
     """Residual action space: target = theta_ref + a (section III-B-2).
 
     Reads `base_key` [..., J] of the present step, rad.
+
+    Examples:
+        >>> td = TensorDict({"action": torch.tensor([[0.1, -0.1]]), "nominal": torch.tensor([[1.0, 2.0]])}, [1])
+        >>> ResidualAction(base_key="nominal").inv(td)["action"]
+        tensor([[1.1000, 1.9000]])
     """
 
     def __init__(self, base_key: NestedKey = ("ref", "joint_pos"), action_key: NestedKey = "action"):
@@ -132,6 +142,11 @@ class DefaultPoseAction(_ActionTransform):
 
     Args:
         default_pos: joint angles, rad, such as the robot's standing pose. [J]
+
+    Examples:
+        >>> td = TensorDict({"action": torch.tensor([[0.1, -0.1]])}, [1])
+        >>> DefaultPoseAction(default_pos=[0.5, 0.0]).inv(td)["action"]
+        tensor([[ 0.6000, -0.1000]])
     """
 
     def __init__(self, default_pos: Sequence[float], action_key: NestedKey = "action"):
@@ -173,6 +188,14 @@ class ActionSmoothing(ActionStateTransform):
         alpha: range of the filter coefficient.
         size: width of the action; None asks the environment.
         state_key: `smoothing/<action_key>` if absent.
+
+    Examples:
+        >>> env = TransformedEnv(base, ActionSmoothing(alpha=(0.5, 0.5)))
+        >>> td = env.reset()
+        >>> for target in (0.2, 0.4):
+        ...     td = env.step_mdp(env.step(td.set("action", torch.full((2, 29), target))))
+        >>> td["robot", "joint_target"][0, 0]  # 0.5 * 0.4 + 0.5 * 0.2
+        tensor(0.3000)
     """
 
     def __init__(
@@ -227,6 +250,14 @@ class ActionDelay(ActionStateTransform):
         decimation: physics steps per control step.
         size: width of the action, J; None asks the environment.
         state_key: `delay/<action_key>` if absent.
+
+    Examples:
+        >>> env = TransformedEnv(base, ActionDelay(substeps=(4, 4), decimation=4))  # of one control step
+        >>> td = env.reset()
+        >>> for target in (0.1, 0.2, 0.3):
+        ...     td = env.step_mdp(env.step(td.set("action", torch.full((2, 29), target))))
+        >>> td["robot", "joint_target"][0, 0]
+        tensor(0.2000)
     """
 
     def __init__(
@@ -284,6 +315,14 @@ class ActionHistory(StateTransform):
     Args:
         steps: H.
         size: A; None asks the environment, for the width of its `env_action_key`.
+
+    Examples:
+        >>> env = TransformedEnv(base, ActionHistory(steps=3, action_key="action"))
+        >>> td = env.reset()
+        >>> for target in (0.1, 0.2):
+        ...     td = env.step_mdp(env.step(td.set("action", torch.full((2, 29), target))))
+        >>> td["action_history"][0, :, 0]
+        tensor([0.2000, 0.1000, 0.0000])
     """
 
     def __init__(

@@ -34,7 +34,14 @@ _ROOT_QUAT: NestedKey = ("robot", "root_quat")
 
 
 class VectorInRoot(FunctionTransform):
-    """A world vector (velocity, force) in the root frame. [N, 3] or [N, E, 3] -> [N, 3] or [N, 3 E]"""
+    """A world vector (velocity, force) in the root frame. [N, 3] or [N, E, 3] -> [N, 3] or [N, 3 E]
+
+    Examples:
+        >>> half_turn = torch.tensor([[0.0, 0.0, 0.0, 1.0]])  # about z
+        >>> td = TensorDict({("robot", "root_quat"): half_turn, "velocity": torch.tensor([[1.0, 2.0, 3.0]])}, [1])
+        >>> VectorInRoot("velocity", ("obs", "velocity"))(td)["obs", "velocity"]
+        tensor([[-1., -2.,  3.]])
+    """
 
     def __init__(self, in_key: NestedKey, out_key: NestedKey, root_quat_key: NestedKey = _ROOT_QUAT):
         super().__init__([in_key, root_quat_key], [out_key])
@@ -45,7 +52,14 @@ class VectorInRoot(FunctionTransform):
 
 
 class PointInRoot(FunctionTransform):
-    """World points in the root frame. [N, 3] or [N, E, 3] -> [N, 3] or [N, 3 E]"""
+    """World points in the root frame. [N, 3] or [N, E, 3] -> [N, 3] or [N, 3 E]
+
+    Examples:
+        >>> root = {("robot", "root_pos"): torch.tensor([[1.0, 0.0, 0.8]]), ("robot", "root_quat"): torch.eye(4)[3:]}
+        >>> td = TensorDict(root | {"hands": torch.tensor([[[0.0, 0.0, 0.8], [1.0, 1.0, 1.0]]])}, [1])
+        >>> PointInRoot("hands", "hands_b")(td)["hands_b"]  # half a turn about z, where the root is
+        tensor([[ 1.0000,  0.0000,  0.0000,  0.0000, -1.0000,  0.2000]])
+    """
 
     def __init__(
         self,
@@ -65,6 +79,12 @@ class PoseInRoot(FunctionTransform):
     """A world pose in the root frame: position and the first two columns of its rotation.
 
     The unified object representation (section III-B-1). [N, 3], [N, 4] -> [N, 9]
+
+    Examples:
+        >>> root = {("robot", "root_pos"): torch.tensor([[1.0, 0.0, 1.0]]), ("robot", "root_quat"): torch.eye(4)[:1]}
+        >>> td = TensorDict(root | {"pos": torch.tensor([[3.0, 0.0, 1.0]]), "quat": torch.eye(4)[:1]}, [1])
+        >>> PoseInRoot("pos", "quat", "pose")(td)["pose"]  # 2 m ahead, not turned
+        tensor([[2., 0., 0., 1., 0., 0., 0., 1., 0.]])
     """
 
     def __init__(
@@ -89,7 +109,13 @@ class PoseInRoot(FunctionTransform):
 
 
 class ProjectedGravity(FunctionTransform):
-    """Direction of gravity in the root frame. [N, 4] -> [N, 3]"""
+    """Direction of gravity in the root frame. [N, 4] -> [N, 3]
+
+    Examples:
+        >>> upside_down = torch.tensor([[0.0, 1.0, 0.0, 0.0]])
+        >>> ProjectedGravity("gravity")(TensorDict({("robot", "root_quat"): upside_down}, [1]))["gravity"]
+        tensor([[0., 0., 1.]])
+    """
 
     def __init__(self, out_key: NestedKey, root_quat_key: NestedKey = _ROOT_QUAT):
         super().__init__([root_quat_key], [out_key])
@@ -104,6 +130,11 @@ class RelativeJointPos(FunctionTransform):
 
     Args:
         default_pos: joint angles, rad. [J]
+
+    Examples:
+        >>> td = TensorDict({("robot", "joint_pos"): torch.tensor([[0.5, 1.0]])}, [1])
+        >>> RelativeJointPos("out", default_pos=[0.5, 0.5])(td)["out"]
+        tensor([[0.0000, 0.5000]])
     """
 
     def __init__(self, out_key: NestedKey, default_pos: Sequence[float], in_key: NestedKey = ("robot", "joint_pos")):
@@ -119,6 +150,11 @@ class Flatten(FunctionTransform):
 
     TorchRL's FlattenObservation flattens between two dimensions that are given; how many there are differs here, and
     flags become numbers.
+
+    Examples:
+        >>> td = TensorDict({"contact": torch.tensor([[[True, False], [True, True]]])}, [1])
+        >>> Flatten("contact", "out")(td)["out"]
+        tensor([[1., 0., 1., 1.]])
     """
 
     def __init__(self, in_key: NestedKey, out_key: NestedKey):
@@ -130,7 +166,13 @@ class Flatten(FunctionTransform):
 
 
 class Difference(FunctionTransform):
-    """a - b as one feature vector per world. [N, ...], [N, ...] -> [N, D]"""
+    """a - b as one feature vector per world. [N, ...], [N, ...] -> [N, D]
+
+    Examples:
+        >>> td = TensorDict({"a": torch.tensor([[[1.0], [2.0]]]), "b": torch.tensor([[[0.5], [0.0]]])}, [1])
+        >>> Difference("a", "b", "out")(td)["out"]
+        tensor([[0.5000, 2.0000]])
+    """
 
     def __init__(self, a_key: NestedKey, b_key: NestedKey, out_key: NestedKey):
         super().__init__([a_key, b_key], [out_key])
@@ -153,6 +195,11 @@ class UniformNoise(FunctionTransform):
 
     Args:
         scale: half range: one figure, or one per feature.
+
+    Examples:
+        >>> noisy = UniformNoise("x", scale=0.1)(TensorDict({"x": torch.ones(1, 1000)}, [1]))["x"]
+        >>> bool((noisy - 1).abs().max() < 0.101), bool(noisy.std() > 0.05)
+        (True, True)
     """
 
     def __init__(self, key: NestedKey, scale: float | Sequence[float]):
@@ -228,6 +275,13 @@ class EpisodeNoise(_EntryState):
     Args:
         scale: half range.
         state_key: `episode_noise/<key>` if absent.
+
+    Examples:
+        >>> env = TransformedEnv(base, EpisodeNoise(("robot", "joint_pos"), scale=0.1))
+        >>> td = env.reset()
+        >>> after = env.rollout(3)["next", "episode_noise", "robot", "joint_pos"]
+        >>> after.shape, bool((after[:, 0] == after[:, -1]).all()), bool((after.abs() <= 0.1).all())
+        (torch.Size([2, 3, 29]), True, True)
     """
 
     def __init__(self, key: NestedKey, scale: float, state_key: NestedKey | None = None):
@@ -246,6 +300,12 @@ class HeadingNoise(FunctionTransform):
 
     Args:
         scale: half range, rad.
+
+    Examples:
+        >>> pose = torch.tensor([[2.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]])  # ahead, not turned
+        >>> turned = HeadingNoise("pose", scale=0.1)(TensorDict({"pose": pose}, [1]))["pose"]
+        >>> turned[:, :3], bool(turned[0, 4].abs() < 0.1)  # the sine of the angle
+        (tensor([[2., 0., 0.]]), True)
     """
 
     def __init__(self, key: NestedKey, scale: float):
@@ -269,6 +329,11 @@ class History(_EntryState):
     Args:
         steps: past observations to keep.
         state_key: `history/<key>` if absent.
+
+    Examples:
+        >>> env = TransformedEnv(base, History(("robot", "joint_pos"), steps=2))
+        >>> env.rollout(3)["robot", "joint_pos"].shape  # 29 joints, now and twice before
+        torch.Size([2, 3, 87])
     """
 
     def __init__(self, key: NestedKey, steps: int, state_key: NestedKey | None = None):

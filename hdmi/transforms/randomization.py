@@ -132,10 +132,17 @@ class MassRandomization(ModelRandomization):
     """Scales mass and inertia of bodies, each on its own, or sets the total mass of an object.
 
     Args:
-        bodies: name patterns. among: which bodies they are matched with, all of the `scene` or the `robot`'s.
+        bodies: name patterns.
+        among: which bodies they are matched with, all of the `scene` or the `robot`'s.
         robot_bodies: ids of the robot's.
         scale: range of the factor; or
         mass: range of the bodies' total mass, kg, shared in proportion.
+
+    Examples:
+        >>> term = MassRandomization(scene.model, bodies=["pelvis"], mass=(5.0, 5.0))
+        >>> term.draw(init := TensorDict({}, [1]))
+        >>> float(init["model", "body_mass"][0, scene.model.body("pelvis").id])  # kg
+        5.0
     """
 
     def __init__(
@@ -174,7 +181,15 @@ class MassRandomization(ModelRandomization):
 
 
 class CenterOfMassRandomization(ModelRandomization):
-    """Shifts the centre of mass of bodies by up to `shift` m along each axis; for `bodies`, see `MassRandomization`."""
+    """Shifts the centre of mass of bodies by up to `shift` m along each axis; for `bodies`, see `MassRandomization`.
+
+    Examples:
+        >>> term = CenterOfMassRandomization(scene.model, bodies=["torso_link"], shift=0.05)
+        >>> term.draw(init := TensorDict({}, [1]))
+        >>> moved = init["model", "body_ipos"][0] - torch.tensor(scene.model.body_ipos).float()
+        >>> moved.any(-1).sum(), bool((moved.abs() <= 0.0501).all())  # one body
+        (tensor(1), True)
+    """
 
     def __init__(
         self,
@@ -204,6 +219,12 @@ class FrictionRandomization(ModelRandomization):
 
     MuJoCo uses the larger friction of two geoms in contact, or that of an object which says so; floor and scenery have
     next to none of their own.
+
+    Examples:
+        >>> term = FrictionRandomization(scene.model, bodies=["left_ankle_roll_link"], friction=(0.4, 0.4))
+        >>> term.draw(init := TensorDict({}, [1]))
+        >>> init["model", "geom_friction"][0, scene.model.geom("left_foot0_collision").id, 0]
+        tensor(0.4000)
     """
 
     def __init__(
@@ -233,11 +254,18 @@ class ObjectScale(ModelRandomization):
     """Scales the object about its body's origin: geoms, hinge and contact points. Writes `init/object_scale` [N, 1].
 
     Args:
-        scale: range. object_geoms: of the model.
+        scale: range.
+        object_geoms: of the model.
         entry: name of what is drawn, under `init_key`.
 
     Raises:
         ValueError: for an object with meshes, which MuJoCo cannot scale per world.
+
+    Examples:
+        >>> term = ObjectScale(scale=(0.9, 1.1))
+        >>> term.draw(init := TensorDict({}, [100]))
+        >>> init["object_scale"].shape, bool(((init["object_scale"] - 1).abs() <= 0.101).all())
+        (torch.Size([100, 1]), True)
     """
 
     def __init__(
@@ -261,7 +289,14 @@ class ObjectScale(ModelRandomization):
 
 
 class ObjectJointRandomization(ModelRandomization):
-    """Draws dry friction (N m) and damping (N m s/rad) of the object's joint."""
+    """Draws dry friction (N m) and damping (N m s/rad) of the object's joint.
+
+    Examples:
+        >>> term = ObjectJointRandomization(scene.model, "waist_yaw_joint", friction=(0.5, 0.5), damping=(2.0, 2.0))
+        >>> term.draw(init := TensorDict({}, [1]))
+        >>> init["model", "dof_damping"][0, scene.model.joint("waist_yaw_joint").dofadr[0]]  # any hinge will do
+        tensor(2.)
+    """
 
     def __init__(
         self,
@@ -294,6 +329,13 @@ class JointOffset(ActionStateTransform):
         offset: half range, rad.
         size: width of the action, J; None asks the environment.
         state_key: `joint_offset/<action_key>` if absent.
+
+    Examples:
+        >>> env = TransformedEnv(base, JointOffset(offset=0.02))
+        >>> td = env.step(env.reset().set("action", torch.zeros(2, 29)))
+        >>> offset = td["joint_offset", "action"]
+        >>> bool((td["next", "robot", "joint_target"] == offset).all()), bool((offset.abs() <= 0.02).all())
+        (True, True)
     """
 
     def __init__(
@@ -333,6 +375,11 @@ class RandomPush(StateTransform):
         interval: range of control steps between pushes.
         linear, angular: half ranges of the added velocity, m/s and rad/s.
         state_key: `push_countdown/<out_key>` if absent.
+
+    Examples:
+        >>> env = TransformedEnv(base, RandomPush(interval=(2, 2), linear=(0.5, 0.5, 0.0), angular=(0.0, 0.0, 0.5)))
+        >>> env.rollout(4)["push_countdown", "push"][0].flatten()  # a step that begins at 1 pushes
+        tensor([2, 1, 2, 1])
     """
 
     def __init__(

@@ -50,9 +50,16 @@ class MotionReference(StateTransform):
 
     Args:
         reference: what to track.
-        tracked_bodies, tracked_joints: name patterns. body_names, joint_names: those of the robot.
+        tracked_bodies, tracked_joints: name patterns.
+        body_names, joint_names: those of the robot.
         future_steps: control steps ahead.
         out_key: under which the reference goes; `step` there is its state.
+
+    Examples:
+        >>> clock = MotionReference(reference, ["torso_link"], [".*_knee_joint"], g1.BODY_NAMES, g1.JOINT_NAMES)
+        >>> td = TransformedEnv(base, clock).rollout(3)
+        >>> td["next", "ref", "step"][0].flatten(), td["next", "ref", "future", "joint_pos"].shape
+        (tensor([1, 2, 3]), torch.Size([2, 3, 5, 2]))
     """
 
     def __init__(
@@ -174,6 +181,12 @@ class ReferenceStateInitialization(SpecTransform):
         joint_ranges: of the robot, rad. [J, 2]
         soft_limit: share of the joint ranges, about their middles, that starts stay in.
         starts: of the reference in its scene; without them the object's size changes nothing, and no support moves.
+
+    Examples:
+        >>> start = ReferenceStateInitialization(reference, g1.JOINT_RANGES, start=100)
+        >>> td = TransformedEnv(base, start).reset()
+        >>> bool(torch.allclose(td["robot", "root_pos"], reference.body_pos[100, 0]))
+        True
     """
 
     _NOISES = (
@@ -252,7 +265,8 @@ class ReferenceStateInitialization(SpecTransform):
         """Perturbed state of the given frames. int64 [N] -> tensors [N, ...]
 
         Args:
-            scale: of the object, [N, 1]. noise_share: factor of the perturbations, [N, 1].
+            scale: of the object, [N, 1].
+            noise_share: factor of the perturbations, [N, 1].
         """
         ref, device = self.reference, frames.device
 
@@ -308,8 +322,17 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
 
     Args:
         start: `uniform` as long as nothing has failed; `first` or a frame, always.
-        bins: number of bins. uniform_share: of starts that ignore failures. decay: of the average, per reset in
-            which any episode has ended. lead: frames before the failure's bin that the start is moved ahead.
+        bins: number of bins.
+        uniform_share: of starts that ignore failures.
+        decay: of the average, per reset in which any episode has ended.
+        lead: frames before the failure's bin that the start is moved ahead.
+
+    Examples:
+        >>> start = AdaptiveStateInitialization(reference, g1.JOINT_RANGES, bins=11, uniform_share=0.0)
+        >>> start.failures[2] = 1.0  # as if all episodes had failed there: in frames 100 to 149 of 550
+        >>> frames = start.sample_frames(torch.Size([1000]), None)
+        >>> int(frames.min()) >= 99, int(frames.max()) <= 149
+        (True, True)
     """
 
     def __init__(
@@ -373,6 +396,13 @@ class MotionEnd(SpecTransform):
 
     Reads next `step_key` int64 [N, 1]; writes `truncated` and `done`, and bool [N, 1] `completed`, of those that no
     termination ends in the same step.
+
+    Examples:
+        >>> start = ReferenceStateInitialization(reference, g1.JOINT_RANGES, start=547)  # of frames 0 to 549
+        >>> clock = MotionReference(reference, ["torso_link"], [".*_knee_joint"], g1.BODY_NAMES, g1.JOINT_NAMES)
+        >>> td = TransformedEnv(base, Compose(start, clock, MotionEnd(reference))).rollout(10)
+        >>> td["next", "completed"][0].flatten()
+        tensor([False,  True])
     """
 
     def __init__(

@@ -32,6 +32,14 @@ class RewardTerm(SpecTransform):
 
     Raises:
         ValueError: from the specs, if the function does not give [N, 1].
+
+    Examples:
+        >>> class Stillness(RewardTerm):
+        ...     def function(self, *inputs):
+        ...         return inputs[0].square().sum(-1, keepdim=True)
+        >>> after = TensorDict({"velocity": torch.tensor([[1.0, 2.0]]), "reward": torch.zeros(1, 1)}, [1])
+        >>> Stillness("stillness", ["velocity"], weight=-0.5)(TensorDict({"next": after}, [1]))["next", "reward"]
+        tensor([[-2.5000]])
     """
 
     def __init__(
@@ -92,6 +100,12 @@ class KernelReward(RewardTerm):
 
     Raises:
         ValueError: if there is no such function, or it does not take these keys and parameters.
+
+    Examples:
+        >>> term = KernelReward("hdmi.functional.tracking", ["error"], "near", weight=2.0, sigma=0.5)
+        >>> after = TensorDict({"error": torch.tensor([[0.5]]), "reward": torch.zeros(1, 1)}, [1])
+        >>> term(TensorDict({"next": after}, [1]))["next", "reward"]  # 2 exp(-1)
+        tensor([[0.7358]])
     """
 
     def __init__(
@@ -120,6 +134,12 @@ class TrackingReward(KernelReward):
     Args:
         errors: keys of non-negative errors [N, K].
         sigmas, tolerances: one per error, in its unit.
+
+    Examples:
+        >>> term = TrackingReward("pose", weight=1.0, errors=["pos", "rot"], sigmas=[0.1, 0.2])
+        >>> after = {"pos": torch.tensor([[0.1]]), "rot": torch.tensor([[0.2]]), "reward": torch.zeros(1, 1)}
+        >>> term(TensorDict({"next": after}, [1]))["next", "reward_terms", "pose"]  # exp(-1), twice
+        tensor([[0.3679]])
     """
 
     def __init__(
@@ -144,7 +164,16 @@ class TrackingReward(KernelReward):
 
 
 class InteractionReward(KernelReward):
-    """Unified interaction reward (section III-B-3); see `functional.interaction`."""
+    """Unified interaction reward (section III-B-3); see `functional.interaction`.
+
+    Examples:
+        >>> zero, firm = torch.zeros(1, 1, 3), torch.full((1, 1, 3), 9.0)
+        >>> contact = {"eef_pos": zero, "target_pos": zero, "force": firm}
+        >>> after = {"contact": contact, "ref": {"contact": torch.tensor([[True]])}, "reward": torch.zeros(1, 1)}
+        >>> td = TensorDict({"next": after}, [1])
+        >>> InteractionReward(weight=5.0)(td)["next", "reward"]  # the hand is at its point and firm: 15.6 N
+        tensor([[5.]])
+    """
 
     def __init__(
         self,
@@ -172,7 +201,13 @@ class InteractionReward(KernelReward):
 
 
 class SurvivalReward(KernelReward):
-    """One for every step that does not terminate; stands behind the terminations."""
+    """One for every step that does not terminate; stands behind the terminations.
+
+    Examples:
+        >>> after = {"terminated": torch.tensor([[True], [False]]), "reward": torch.zeros(2, 1)}
+        >>> SurvivalReward(weight=1.0)(TensorDict({"next": after}, [2]))["next", "reward"].flatten()
+        tensor([0., 1.])
+    """
 
     def __init__(
         self,
@@ -186,7 +221,13 @@ class SurvivalReward(KernelReward):
 
 
 class ActionRateL2(RewardTerm):
-    """Squared change of the policy's action; see `functional.action_rate`. Reads a history [N, H >= 2, A]."""
+    """Squared change of the policy's action; see `functional.action_rate`. Reads a history [N, H >= 2, A].
+
+    Examples:
+        >>> after = {"action_history": torch.tensor([[[1.0, 2.0], [0.0, 0.0]]]), "reward": torch.zeros(1, 1)}
+        >>> ActionRateL2(weight=-0.1)(TensorDict({"next": after}, [1]))["next", "reward"]
+        tensor([[-0.5000]])
+    """
 
     def __init__(
         self,
@@ -208,6 +249,12 @@ class JointPosLimitsL1(KernelReward):
     Args:
         joint_ranges: rad. [J, 2]
         soft_limit: share of the range, about its middle, that costs nothing.
+
+    Examples:
+        >>> term = JointPosLimitsL1(joint_ranges=[(-1.0, 1.0)], weight=-10.0, soft_limit=0.5)
+        >>> after = {"robot": {"joint_pos": torch.tensor([[0.75]])}, "reward": torch.zeros(1, 1)}
+        >>> term(TensorDict({"next": after}, [1]))["next", "reward"]  # 0.25 rad beyond 0.5
+        tensor([[-2.5000]])
     """
 
     def __init__(
@@ -230,6 +277,12 @@ class JointTorqueLimitsL1(KernelReward):
     Args:
         effort_limits: N m. [J]
         soft_limit: share of them that costs nothing.
+
+    Examples:
+        >>> term = JointTorqueLimitsL1(effort_limits=[100.0], weight=-0.01, soft_limit=0.5)
+        >>> after = {"robot": {"joint_torque": torch.tensor([[-80.0]])}, "reward": torch.zeros(1, 1)}
+        >>> term(TensorDict({"next": after}, [1]))["next", "reward"]  # 30 N m beyond 50
+        tensor([[-0.3000]])
     """
 
     def __init__(
@@ -249,7 +302,13 @@ class JointTorqueLimitsL1(KernelReward):
 
 
 class JointVelL2(KernelReward):
-    """Squared joint velocity, (rad/s)^2, summed over joints."""
+    """Squared joint velocity, (rad/s)^2, summed over joints.
+
+    Examples:
+        >>> after = {"robot": {"joint_vel": torch.tensor([[1.0, 2.0]])}, "reward": torch.zeros(1, 1)}
+        >>> JointVelL2(weight=-1.0)(TensorDict({"next": after}, [1]))["next", "reward"]
+        tensor([[-5.]])
+    """
 
     def __init__(
         self,
@@ -267,6 +326,12 @@ class FeetImpactL2(KernelReward):
 
     Args:
         robot_mass: kg.
+
+    Examples:
+        >>> landed = torch.tensor([[[0.0, 0.0, 981.0], [0.0, 0.0, 0.0]]])  # a robot of 50 kg, with twice its weight
+        >>> after = {"feet": {"force": landed, "previous_force": torch.zeros(1, 2, 3)}, "reward": torch.zeros(1, 1)}
+        >>> FeetImpactL2(robot_mass=50.0, weight=-1.0)(TensorDict({"next": after}, [1]))["next", "reward"]
+        tensor([[-4.]])
     """
 
     def __init__(
@@ -290,6 +355,14 @@ class FeetSlip(RewardTerm):
 
     Args:
         feet: names of their bodies, among `body_names`.
+
+    Examples:
+        >>> velocity = torch.tensor([[[0.0, 0.0, 0.0], [0.3, 0.4, 0.0], [1.0, 0.0, 0.0]]])  # of root and feet
+        >>> load = torch.tensor([[[0.0, 0.0, 200.0], [0.0, 0.0, 0.0]]])  # the right foot is in the air
+        >>> after = {"robot": {"body_lin_vel": velocity, "foot_force": load}, "reward": torch.zeros(1, 1)}
+        >>> term = FeetSlip(["left", "right"], body_names=["root", "left", "right"], weight=-1.0)
+        >>> term(TensorDict({"next": after}, [1]))["next", "reward"]
+        tensor([[-0.5000]])
     """
 
     def __init__(
@@ -315,7 +388,14 @@ class FeetSlip(RewardTerm):
 
 
 class FeetStumble(KernelReward):
-    """Feet that run into the edge of a step; see `functional.feet_stumble`. Reads `robot/foot_force` [N, 2, 3]."""
+    """Feet that run into the edge of a step; see `functional.feet_stumble`. Reads `robot/foot_force` [N, 2, 3].
+
+    Examples:
+        >>> load = torch.tensor([[[50.0, 0.0, 10.0], [0.0, 0.0, 200.0]]])  # the left foot runs into something
+        >>> after = {"robot": {"foot_force": load}, "reward": torch.zeros(1, 1)}
+        >>> FeetStumble(weight=-1.0, ratio=4.0)(TensorDict({"next": after}, [1]))["next", "reward"]
+        tensor([[-1.]])
+    """
 
     def __init__(
         self,
@@ -330,7 +410,14 @@ class FeetStumble(KernelReward):
 
 
 class FeetAirTime(KernelReward):
-    """Swings shorter than a threshold; see `functional.feet_air_time`."""
+    """Swings shorter than a threshold; see `functional.feet_air_time`.
+
+    Examples:
+        >>> feet = {"swing_time": torch.tensor([[0.15, 0.0]]), "touchdown": torch.tensor([[True, False]])}
+        >>> td = TensorDict({"next": {"feet": feet, "reward": torch.zeros(1, 1)}}, [1])
+        >>> FeetAirTime(weight=-4.0, threshold=0.4)(td)["next", "reward"]  # 0.25 s short
+        tensor([[-1.]])
+    """
 
     def __init__(
         self,
@@ -353,6 +440,10 @@ class RewardRate(SpecTransform):
 
     Args:
         control_dt: s.
+
+    Examples:
+        >>> RewardRate(control_dt=0.02)(TensorDict({"next": {"reward": torch.tensor([[5.0]])}}, [1]))["next", "reward"]
+        tensor([[0.1000]])
     """
 
     def __init__(self, control_dt: float, reward_key: NestedKey = "reward"):

@@ -26,6 +26,14 @@ class TerminationTerm(StateTransform):
 
     Args:
         flag_key, count_key: `termination/<name>` and `termination_steps/<name>` if absent.
+
+    Examples:
+        >>> class Fallen(TerminationTerm):
+        ...     def condition(self, *inputs):
+        ...         return inputs[0][:, 2:] < 2.0  # the whole robot
+        >>> env = TransformedEnv(base, Fallen("fallen", [("robot", "root_pos")], min_steps=3))
+        >>> env.rollout(10)["next", "termination", "fallen"][0].flatten().tolist()
+        [False, False, True]
     """
 
     def __init__(
@@ -86,6 +94,12 @@ class KernelTermination(TerminationTerm):
 
     Raises:
         ValueError: if there is no such function, or it does not take these keys and parameters.
+
+    Examples:
+        >>> term = KernelTermination("hdmi.functional.error_exceeds", ["speed"], "fast", min_steps=2, threshold=1.0)
+        >>> term.condition(torch.tensor([[0.5], [1.5]]))
+        tensor([[False],
+                [ True]])
     """
 
     def __init__(
@@ -111,7 +125,14 @@ class ErrorTermination(KernelTermination):
     """Root, body-local and object pose errors: any of the errors above its threshold.
 
     Args:
-        errors: keys of errors [N, K]. thresholds: one per error, in its unit.
+        errors: keys of errors [N, K].
+        thresholds: one per error, in its unit.
+
+    Examples:
+        >>> term = ErrorTermination("far", errors=["position", "angle"], thresholds=[0.5, 1.0], min_steps=25)
+        >>> term.condition(torch.tensor([[0.1, 0.6], [0.1, 0.2]]), torch.tensor([[0.2], [0.2]]))
+        tensor([[ True],
+                [False]])
     """
 
     def __init__(
@@ -138,11 +159,17 @@ class LostContact(KernelTermination):
     Reads `contact/{eef_pos, target_pos, force}` [N, E, 3] (m, m, N) and `ref/contact` bool [N, E].
 
     Args:
-        distance: m. min_force: N.
+        distance: m.
+        min_force: N.
         require: for a loss, `either` of the two, or `both`.
 
     Raises:
         ValueError: for another `require`.
+
+    Examples:
+        >>> hand, target, force = torch.full((1, 1, 3), 0.3), torch.zeros(1, 1, 3), torch.zeros(1, 1, 3)
+        >>> LostContact(distance=0.2).condition(hand, target, force, torch.tensor([[True]]))  # 0.52 m off
+        tensor([[True]])
     """
 
     def __init__(
@@ -175,6 +202,11 @@ class BodyHeight(TerminationTerm):
 
     Args:
         body: among `body_names`, those of `body_pos_key` [N, B, 3].
+
+    Examples:
+        >>> low = BodyHeight("torso", body_names=["pelvis", "torso"], threshold=0.3)
+        >>> low.condition(torch.tensor([[[0.0, 0.0, 0.2], [0.0, 0.0, 0.4]]]))  # the torso is 0.4 m high
+        tensor([[False]])
     """
 
     def __init__(

@@ -27,6 +27,15 @@ class TrackedBodies(FunctionTransform):
         tracked_bodies: name patterns.
         body_names: of the B bodies.
         out_key: under which the six entries go.
+
+    Examples:
+        >>> places = torch.tensor([[[1.0, 1.0, 0.8], [1.0, 1.0, 1.2]]])
+        >>> pose = {"body_pos": places, "root_pos": places[:, 0]}
+        >>> turns = {"body_quat": torch.eye(4)[:1].expand(1, 2, 4), "root_quat": torch.eye(4)[:1]}
+        >>> velocities = {"body_lin_vel": torch.zeros(1, 2, 3), "body_ang_vel": torch.zeros(1, 2, 3)}
+        >>> td = TensorDict({"robot": pose | turns | velocities}, [1])
+        >>> TrackedBodies(["torso"], body_names=["pelvis", "torso"])(td)["tracked", "body_pos_local"]
+        tensor([[[0.0000, 0.0000, 1.2000]]])
     """
 
     def __init__(
@@ -56,7 +65,13 @@ class TrackedBodies(FunctionTransform):
 
 
 class Distance(FunctionTransform):
-    """Euclidean distance between vectors. [..., 3], [..., 3] -> [...], or [..., 1] if that drops the last dimension."""
+    """Euclidean distance between vectors. [..., 3], [..., 3] -> [...], or [..., 1] if that drops the last dimension.
+
+    Examples:
+        >>> td = TensorDict({"a": torch.tensor([[3.0, 4.0, 0.0]]), "b": torch.zeros(1, 3)}, [1])
+        >>> Distance("a", "b", ("error", "pos"))(td)["error", "pos"]
+        tensor([[5.]])
+    """
 
     def __init__(self, a_key: NestedKey, b_key: NestedKey, out_key: NestedKey):
         super().__init__([a_key, b_key], [out_key])
@@ -66,7 +81,13 @@ class Distance(FunctionTransform):
 
 
 class Angle(FunctionTransform):
-    """Angle between orientations, rad. [..., 4], [..., 4] -> [...], or [..., 1] if that drops the last dimension."""
+    """Angle between orientations, rad. [..., 4], [..., 4] -> [...], or [..., 1] if that drops the last dimension.
+
+    Examples:
+        >>> td = TensorDict({"a": torch.eye(4)[:1], "b": torch.eye(4)[1:2]}, [1])  # half a turn about x
+        >>> Angle("a", "b", ("error", "rot"))(td)["error", "rot"]
+        tensor([[3.1416]])
+    """
 
     def __init__(self, a_key: NestedKey, b_key: NestedKey, out_key: NestedKey):
         super().__init__([a_key, b_key], [out_key])
@@ -76,7 +97,13 @@ class Angle(FunctionTransform):
 
 
 class AbsoluteDifference(FunctionTransform):
-    """Absolute difference of scalars, of the selected columns if `index` is given. [..., J] -> [..., J']"""
+    """Absolute difference of scalars, of the selected columns if `index` is given. [..., J] -> [..., J']
+
+    Examples:
+        >>> td = TensorDict({"a": torch.tensor([[1.0, 2.0, 3.0]]), "b": torch.tensor([[0.0, 2.5, 3.0]])}, [1])
+        >>> AbsoluteDifference("a", "b", "error", index=[0, 1])(td)["error"]
+        tensor([[1.0000, 0.5000]])
+    """
 
     def __init__(self, a_key: NestedKey, b_key: NestedKey, out_key: NestedKey, index: Sequence[int] | None = None):
         super().__init__([a_key, b_key], [out_key])
@@ -96,6 +123,13 @@ class BodyHeightError(FunctionTransform):
 
     Raises:
         ValueError: if `body` is none of the tracked ones.
+
+    Examples:
+        >>> error = BodyHeightError("torso", ["pelvis", "torso"], body_names=["pelvis", "torso", "head"])
+        >>> bodies = torch.tensor([[[0.0, 0.0, 0.8], [0.0, 0.0, 1.0]]])
+        >>> td = TensorDict({("tracked", "body_pos"): bodies, ("ref", "body_pos"): bodies + 0.25}, [1])
+        >>> error(td)["error", "torso_height"]
+        tensor([[0.2500]])
     """
 
     def __init__(
@@ -119,7 +153,13 @@ class JointErrors(AbsoluteDifference):
     """Absolute error of the tracked joints. [..., J], [..., J] -> [..., J']
 
     Args:
-        tracked_joints: name patterns. joint_names: of the J joints.
+        tracked_joints: name patterns.
+        joint_names: of the J joints.
+
+    Examples:
+        >>> errors = JointErrors("q", "q_ref", "error", tracked_joints=[".*_knee"], joint_names=["hip", "left_knee"])
+        >>> errors(TensorDict({"q": torch.tensor([[1.0, 0.5]]), "q_ref": torch.zeros(1, 2)}, [1]))["error"]
+        tensor([[0.5000]])
     """
 
     def __init__(
@@ -148,6 +188,15 @@ class ContactPoints(FunctionTransform):
     Args:
         effectors: their bodies, and the point of each in the frame of its body.
         body_names: of the B bodies.
+
+    Examples:
+        >>> from hdmi.assets import Effector
+        >>> points = ContactPoints([Effector("hand", point=(0.1, 0.0, 0.0))], body_names=["pelvis", "hand"])
+        >>> robot = {"body_pos": torch.ones(1, 2, 3), "body_quat": torch.eye(4)[:1].expand(1, 2, 4)}
+        >>> link = {"link_pos": torch.zeros(1, 3), "link_quat": torch.eye(4)[:1], "scale": torch.full((1, 1), 2.0)}
+        >>> td = TensorDict({"robot": robot, "object": link, "ref": {"contact_point": torch.ones(1, 1, 3)}}, [1])
+        >>> points(td)["contact", "eef_pos"], td["contact", "target_pos"]  # the object is twice as large
+        (tensor([[[1.1000, 1.0000, 1.0000]]]), tensor([[[2., 2., 2.]]]))
     """
 
     def __init__(
@@ -188,8 +237,14 @@ class FeetState(StateTransform):
     `touchdown` bool [N, 2].
 
     Args:
-        control_dt: s. force_threshold: N, above which a foot is in contact.
+        control_dt: s.
+        force_threshold: N, above which a foot is in contact.
         out_key: under which the five entries go, which are its state, too.
+
+    Examples:
+        >>> env = TransformedEnv(base, FeetState(control_dt=0.02, force_threshold=1e9))  # as if always in the air
+        >>> env.rollout(3)["next", "feet", "air_time"][0, :, 0]  # s, of the left foot
+        tensor([0.0200, 0.0400, 0.0600])
     """
 
     def __init__(
@@ -236,6 +291,11 @@ class Metrics(FunctionTransform):
 
     Args:
         out_key: under which they go.
+
+    Examples:
+        >>> metrics = Metrics({"joint_error": ("error", "joints"), "object_error": None})
+        >>> metrics(TensorDict({("error", "joints"): torch.tensor([[0.1, 0.3]])}, [1]))["metrics", "joint_error"]
+        tensor([[0.2000]])
     """
 
     def __init__(self, keys: Mapping[str, NestedKey | Sequence[str] | None], out_key: NestedKey = "metrics"):
@@ -254,6 +314,12 @@ class ContactMade(FunctionTransform):
 
     Args:
         min_force: N, as in the lost-contact termination.
+
+    Examples:
+        >>> force = torch.tensor([[[5.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])
+        >>> td = TensorDict({("contact", "force"): force, ("ref", "contact"): torch.tensor([[True, True]])}, [1])
+        >>> ContactMade(min_force=1.0)(td)["contact", "made"]
+        tensor([[1., 0.]])
     """
 
     def __init__(

@@ -40,7 +40,14 @@ SMPL_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17
 
 @dataclass(frozen=True)
 class ObjectTrajectory:
-    """Where an object is in each frame of a motion. Float32, world frame, z up."""
+    """Where an object is in each frame of a motion. Float32, world frame, z up.
+
+    Examples:
+        >>> box = ObjectTrajectory("box", pos=np.zeros((2, 3)), quat=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)))
+        >>> motion = HumanMotion("reach", 30.0, 1.7, ("pelvis",), joint_pos=np.zeros((2, 1, 3)), object=box)
+        >>> motion.shifted(np.array([0.0, 0.0, 0.5])).object.pos[0].tolist()
+        [0.0, 0.0, 0.5]
+    """
 
     name: str
     pos: np.ndarray  # [T, 3] m
@@ -59,6 +66,11 @@ class HumanMotion:
     Raises:
         MotionError: for names that are not distinct, wrong shapes, values that are not finite, quaternions that are
             not unit, a rate or height that cannot be.
+
+    Examples:
+        >>> motion = HumanMotion("sway", fps=30.0, height=1.7, joint_names=("pelvis",), joint_pos=np.zeros((31, 1, 3)))
+        >>> motion.resample(60.0).num_frames  # of the same second
+        61
     """
 
     name: str
@@ -99,6 +111,7 @@ class HumanMotion:
 
     @property
     def num_frames(self) -> int:
+        """T."""
         return len(self.joint_pos)
 
     def index(self, joint: str) -> int:

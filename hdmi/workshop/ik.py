@@ -46,6 +46,12 @@ class PointTarget:
         weight: per m; one figure, one per frame [T, 1], per world axis [3], or both [T, 3]. Zero: no target there.
         point: in the body's frame, m.
         name: under which the residual is reported; the body's if absent.
+
+    Examples:
+        >>> reach = PointTarget("left_wrist_yaw_link", pos=[0.3, 0.2, 0.9], weight=10.0)
+        >>> result = solve([reach, PostureTarget(standing()[7:], weight=0.05)], num_frames=1, fps=50.0)
+        >>> bool(result.residuals["left_wrist_yaw_link"][0] < 0.01)  # m
+        True
     """
 
     body: str
@@ -64,6 +70,12 @@ class OrientationTarget:
         quat: wxyz, world. [T, 4] or [4]
         weight: per rad; as for `PointTarget`, but about the axes of the target's frame.
         name: under which the residual is reported; `<body> orientation` if absent.
+
+    Examples:
+        >>> level = OrientationTarget("left_wrist_yaw_link", quat=[1.0, 0.0, 0.0, 0.0], weight=3.0)
+        >>> result = solve([level, PostureTarget(standing()[7:], weight=0.05)], num_frames=1, fps=50.0)
+        >>> bool(result.residuals["left_wrist_yaw_link orientation"][0] < 0.01)  # rad
+        True
     """
 
     body: str
@@ -74,7 +86,14 @@ class OrientationTarget:
 
 @dataclass(frozen=True)
 class ComTarget:
-    """Where the robot's centre of mass should be: `pos` [T, 3] or [3] in m, weight as for `PointTarget`."""
+    """Where the robot's centre of mass should be: `pos` [T, 3] or [3] in m, weight as for `PointTarget`.
+
+    Examples:
+        >>> lower = ComTarget(pos=[0.0, 0.0, 0.6], weight=10.0)
+        >>> result = solve([lower, PostureTarget(standing()[7:], weight=0.05)], num_frames=1, fps=50.0)
+        >>> bool(result.residuals["com"][0] < 0.01)  # m
+        True
+    """
 
     pos: ArrayLike
     weight: ArrayLike
@@ -88,6 +107,11 @@ class PostureTarget:
     Args:
         joint_pos: in table order, rad. [T, 29] or [29]
         weight: per rad; one figure, [T, 1], [29] or [T, 29].
+
+    Examples:
+        >>> result = solve([PostureTarget(standing()[7:], weight=1.0)], num_frames=1, fps=50.0)
+        >>> bool(np.allclose(result.joint_pos[0], standing()[7:], atol=1e-3))
+        True
     """
 
     joint_pos: ArrayLike
@@ -106,6 +130,13 @@ class Obstacle:
         name: not one of the robot's bodies.
         geoms: in its frame, as those of `hdmi.assets.ObjectConfig`.
         pos, quat: world. [T, 3] or [3], [T, 4] or [4]
+
+    Examples:
+        >>> wall = Obstacle("wall", geoms=[{"box": (0.1, 2.0, 2.0)}], pos=[0.45, 0.0, 0.0], quat=[1.0, 0.0, 0.0, 0.0])
+        >>> reach = PointTarget("left_wrist_yaw_link", pos=[0.5, 0.2, 0.9], weight=10.0)
+        >>> result = solve([reach, PostureTarget(standing()[7:], weight=0.5)], num_frames=1, fps=50.0, obstacles=[wall])
+        >>> bool(result.penetration["wall"].max() < 0.005)  # m
+        True
     """
 
     name: str
@@ -128,6 +159,13 @@ class IkOptions:
         smoothing: weight per rad, of going on at the joints' present speed.
         self_collision: clearance kept between parts of the robot, m; None: they may pass through each other.
         floor: height that nothing of the robot may be below, m; None: there is no floor.
+
+    Examples:
+        >>> options = IkOptions(floor=0.0)
+        >>> down = PointTarget("left_ankle_roll_link", pos=[0.0, 0.12, -0.5], weight=10.0)
+        >>> result = solve([down, PostureTarget(standing()[7:], weight=0.5)], num_frames=1, fps=50.0, options=options)
+        >>> bool(result.penetration["floor"].max() < 0.005)  # m
+        True
     """
 
     max_iterations: int = 20
@@ -144,7 +182,13 @@ class IkOptions:
 
 @dataclass(frozen=True)
 class IkResult:
-    """Solved frames and how well they meet their targets."""
+    """Solved frames and how well they meet their targets.
+
+    Examples:
+        >>> result = solve([PostureTarget(standing()[7:], weight=1.0)], num_frames=3, fps=50.0)
+        >>> result.qpos.shape, result.failures.tolist()
+        ((3, 36), [])
+    """
 
     root_pos: np.ndarray  # [T, 3] m
     root_quat: np.ndarray  # [T, 4] wxyz

@@ -55,6 +55,13 @@ class Skeleton:
     """A tree of joints; with all rotations zero it stands in a T-pose, x left, y up, z forward.
 
     `offset` of the root is where it rests relative to the origin that translations move.
+
+    Examples:
+        >>> body = anthropometric_skeleton(height=2.0)
+        >>> pos, quat = body.forward(np.zeros((1, 22, 3)), np.zeros((1, 3)))
+        >>> hip, ankle = pos[0, body.index("left_hip")], pos[0, body.index("left_ankle")]
+        >>> round(float(hip[1] - ankle[1]), 3)  # legs are 0.491 of the height
+        0.982
     """
 
     joint_names: tuple[str, ...]
@@ -63,6 +70,7 @@ class Skeleton:
     height: float  # m
 
     def index(self, joint: str) -> int:
+        """Number of a joint."""
         return self.joint_names.index(joint)
 
     def forward(self, rotation: np.ndarray, root_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,8 @@
 """From a robot motion and an object to a reference: the object's trajectory, contact labels and contact points.
 
+```python
 annotated = annotate_motion(motion, object=box, effectors=hands, overrides=load_overrides("annotation.yaml"))
+```
 """
 
 from hdmi.assets.surface import Surface, object_surfaces

@@ -34,6 +34,15 @@ class ContactCriteria:
         reach: up to this distance an object that moves along is held, m.
         pause: interruptions up to this long are bridged, and contacts shorter than it are dropped, s.
         lead: an object is touched at most this long before it first and after it last moves, s.
+
+    Examples:
+        >>> from hdmi.assembly import scene_parts
+        >>> from hdmi.config import task_config
+        >>> from hdmi.motion import find_motion, load_motion, make_playback
+        >>> parts = scene_parts(task_config("lift_box"))
+        >>> playback = make_playback(load_motion(find_motion("lift_box")), **parts)
+        >>> intervals(find_contacts(playback, parts["object"], ContactCriteria(touch=0.02))[:, 0])  # of the left hand
+        [(71, 226)]
     """
 
     touch: float = 0.03

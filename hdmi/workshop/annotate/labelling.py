@@ -177,7 +177,13 @@ def _with_column(
 
 @dataclass(frozen=True)
 class Agreement:
-    """How found labels compare with given ones, over all frames and effectors."""
+    """How found labels compare with given ones, over all frames and effectors.
+
+    Examples:
+        >>> found, given = np.array([[True], [True], [False]]), np.array([[True], [False], [False]])
+        >>> agreement(found, given)
+        Agreement(precision=0.5, recall=1.0)
+    """
 
     precision: float
     recall: float

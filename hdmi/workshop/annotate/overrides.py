@@ -29,7 +29,7 @@ from yaml import YAMLError
 
 from hdmi.motion.check import MotionError
 
-FILE = "annotation.yaml"
+FILE = "annotation.yaml"  # beside the motion
 _IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 Point = tuple[float, float, float]
@@ -37,7 +37,15 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Interval:
-    """Frames from `first` to `last` in which an effector touches the object, at `point` in its link's frame."""
+    """Frames from `first` to `last` in which an effector touches the object, at `point` in its link's frame.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> Path(FILE).write_text("contacts: {left_wrist_yaw_link: [{frames: [40, 80]}]}") > 0
+        True
+        >>> load_overrides(FILE).contacts["left_wrist_yaw_link"]
+        (Interval(first=40, last=80, point=None),)
+    """
 
     first: int
     last: int
@@ -53,6 +61,13 @@ class Overrides:
         hinge: frame -> angle, rad.
         contacts: effector's body -> its intervals.
         points: effector's body -> point in the frame of the object's link, m.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> Path(FILE).write_text("object: [{frame: 0, pos: [0.4, 0.2, 0.8]}]") > 0
+        True
+        >>> load_overrides(FILE).object  # position and quaternion
+        {0: ((0.4, 0.2, 0.8), (1.0, 0.0, 0.0, 0.0))}
     """
 
     object: Mapping[int, tuple[Sequence[float], Sequence[float]]] = field(default_factory=dict)

@@ -54,7 +54,14 @@ Vector = tuple[float, ...]
 
 
 class PlanError(MotionError):
-    """A plan that cannot be read or solved; the message names the file and the key."""
+    """A plan that cannot be read or solved; the message names the file and the key.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> parse_plan({"duration": 2.0, "hips": []}, Path("squat.yaml"))
+        Traceback (most recent call last):
+        hdmi.workshop.author.plan.PlanError: squat.yaml: unknown 'hips'; there is duration, phases, ...
+    """
 
 
 @dataclass(frozen=True)
@@ -113,7 +120,13 @@ class Walk:
 
 @dataclass(frozen=True)
 class Plan:
-    """A motion written down as keyframes; see the module."""
+    """A motion written down as keyframes; see the module.
+
+    Examples:
+        >>> plan = load_plan(find_plan("lift_box"))
+        >>> plan.duration, sorted(plan.hands)
+        (6.0, ['left', 'right'])
+    """
 
     name: str
     file: Path
@@ -146,15 +159,16 @@ class _Node:
         if not isinstance(value, Mapping):
             raise PlanError(f"{where}: expected a mapping, got {value!r}")
         self.value, self.where, self.phases = value, where, phases
+        self.place = where.removesuffix(": ")  # for messages about the file as a whole
 
     def only(self, *known: str) -> None:
         if unknown := [key for key in self.value if key not in known]:
-            raise PlanError(f"{self.where}: unknown {', '.join(map(repr, unknown))}; there is {', '.join(known)}")
+            raise PlanError(f"{self.place}: unknown {', '.join(map(repr, unknown))}; there is {', '.join(known)}")
 
     def get(self, key: str, default: Any = ...) -> Any:
         if key not in self.value:
             if default is ...:
-                raise PlanError(f"{self.where}: lacks {key!r}")
+                raise PlanError(f"{self.place}: lacks {key!r}")
             return default
         return self.value[key]
 

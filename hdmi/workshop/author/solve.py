@@ -40,7 +40,14 @@ _ROUGH_STRIDE, _ROUGH_TOLERANCE = 2, 2e-3  # of corrections: the centre of mass 
 
 @dataclass(frozen=True)
 class Authored:
-    """A solved plan and how well it came out."""
+    """A solved plan and how well it came out.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> stand = author_motion(parse_plan({"duration": 0.2}, Path("stand.yaml")))
+        >>> stand.motion.num_frames, stand.unsettled
+        (10, 0)
+    """
 
     motion: Motion
     misses: dict[str, float]  # largest distance of hands, feet and centre of mass from where the plan wants them, m

@@ -14,7 +14,16 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class RetargetReport:
-    """Figures of one retargeting. Statistics are over frames."""
+    """Figures of one retargeting. Statistics are over frames.
+
+    Examples:
+        >>> from hdmi.workshop.skeleton import anthropometric_skeleton, pose_skeleton
+        >>> rotation, transl = np.zeros((5, 22, 3)), np.zeros((5, 3))  # a T-pose
+        >>> human = pose_skeleton("person", anthropometric_skeleton(1.75), rotation, transl, 50.0, y_up=True)
+        >>> motion, report = retarget(human, options=RetargetOptions(ground="shift"))
+        >>> report.frames, report.height, report.solver_failures
+        (5, 1.75, [])
+    """
 
     name: str
     frames: int
@@ -38,6 +47,7 @@ class RetargetReport:
         return asdict(self)
 
     def to_json(self) -> str:
+        """Those values as json."""
         return json.dumps(self.as_dict(), indent=1) + "\n"
 
     def table(self) -> RenderableType:

@@ -62,6 +62,11 @@ class RetargetOptions:
         ground: `shift` the person vertically until the lowest sole touches the ground, `keep` the height, or None:
             shift if the sole misses the ground by more than 5 cm.
         ik: of the inverse kinematics; by default it keeps the robot out of floor, object and itself.
+
+    Examples:
+        >>> options = RetargetOptions(fps=30.0, cutoff=3.0)
+        >>> options.ik.floor  # m
+        0.0
     """
 
     fps: float = 50.0

@@ -59,6 +59,12 @@ class Conventions:
 
     Raises:
         MotionError: for any other value.
+
+    Examples:
+        >>> Conventions(angles="degrees").radians(np.array([180.0, 90.0]))
+        array([3.14159265, 1.57079633])
+        >>> Conventions(quat="xyzw").wxyz(np.array([0.0, 0.0, 0.0, 1.0]), usual="wxyz")
+        array([1., 0., 0., 0.])
     """
 
     quat: str | None = None

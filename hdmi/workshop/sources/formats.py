@@ -52,6 +52,7 @@ def _read_hdmi(path: Path, options: Options) -> Motion:
     return settle(motion, path / "motion.npz", options.given, has_scenery=True)
 
 
+# what `convert` reads and writes, by name
 FORMATS = {
     "hdmi": Format(
         "",

@@ -23,7 +23,7 @@ _FORMATS: dict[str, tuple[Callable[..., HumanMotion], tuple[str, ...]]] = {
     "intermimic": (read_intermimic, ("height",)),
     "bvh": (read_bvh, ("height", "names", "angles")),
 }
-PERSON_FORMATS = tuple(_FORMATS)
+PERSON_FORMATS = tuple(_FORMATS)  # names of what `read_person` reads
 
 
 def read_person(

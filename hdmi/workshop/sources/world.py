@@ -37,7 +37,7 @@ _STEADY, _TRAVELS = 0.15, 1.0  # m, of how the lowest joint's height varies: the
 class World(TypedDict, total=False):
     """How the world of a file is read; what is absent or None is as usual for the format.
 
-    Keys:
+    Attributes:
         up: the axis of the file that points up: x, y, z, -x, -y or -z.
         unit: of the file's lengths, m.
         ground: `shift` the motion vertically until the lowest sole touches the ground, or `keep` its height. Usually

@@ -1,8 +1,10 @@
 """Whether a motion is worth training on: geometry, limits, dynamics and contact labels held against a table of limits.
 
+```python
 report = validate_motion(load_motion(path), object=..., scenery=..., effectors=...)
 report.verdict      # "good", "usable" or "bad"
 report.reasons      # what, how much, where, in which frames
+```
 """
 
 from __future__ import annotations

@@ -33,6 +33,12 @@ class Dynamics:
     force, since a kinematic reference has hands near the object rather than on it. Non-negative least squares asks
     first for the balance of the unactuated degrees of freedom (root, object), and then for small torques relative to
     the effort limits. A frame without enough contact leaves a wrench unexplained.
+
+    Examples:
+        >>> from hdmi.motion import find_motion, load_motion, make_playback
+        >>> dynamics = inverse_dynamics(make_playback(load_motion(find_motion("walk"))), ground_gap=0.0)
+        >>> dynamics.torque.shape, bool(dynamics.in_flight.any())
+        ((550, 29), False)
     """
 
     torque: np.ndarray  # [T, 29] N m

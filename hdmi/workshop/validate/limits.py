@@ -16,6 +16,12 @@ class Limit:
         unit: of both.
         about: what is measured, of the worst body, joint or effector in a frame.
         share: of the frames that the check applies to may lie above either bound.
+
+    Examples:
+        >>> from hdmi.motion import find_motion, load_motion
+        >>> slow = LIMITS | {"joint_velocity": Limit(0.1, 0.2, "of limit", "joint speed")}
+        >>> validate_motion(load_motion(find_motion("walk")), limits=slow).verdict
+        'bad'
     """
 
     good: float

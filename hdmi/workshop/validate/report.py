@@ -14,7 +14,7 @@ from rich.table import Table
 
 from hdmi.workshop.validate.limits import Limit
 
-Verdict = Literal["good", "usable", "bad"]
+Verdict = Literal["good", "usable", "bad"]  # of a check, and of a motion
 _ORDER: tuple[Verdict, ...] = ("good", "usable", "bad")
 _STYLE = {"good": "green", "usable": "yellow", "bad": "red"}
 
@@ -26,6 +26,12 @@ class Series:
     Args:
         values: larger is worse, NaN where it does not apply. [T, K]
         parts: bodies, joints or effectors that the columns are about. [K]
+
+    Examples:
+        >>> from hdmi.workshop.validate.report import judge
+        >>> slide = Series(values=np.array([[0.1, 0.0], [0.1, 0.3]]), parts=["left foot", "right foot"])
+        >>> judge("foot_slide", slide, Limit(0.15, 0.5, "m/s", "planted foot")).reason()
+        'foot_slide 0.3 m/s, above 0.15: right foot, frame 1'
     """
 
     values: np.ndarray
@@ -34,7 +40,13 @@ class Series:
 
 @dataclass(frozen=True)
 class Fault:
-    """Consecutive frames above what is good, the worst of them, and which part is worst there."""
+    """Consecutive frames above what is good, the worst of them, and which part is worst there.
+
+    Examples:
+        >>> fault = Fault(first=4, last=6, worst=5, value=0.3, part="left foot")
+        >>> Finding("foot_slide", "usable", 0.3, "m/s", 0.15, 0.5, "planted foot", (fault,)).reason()
+        'foot_slide 0.3 m/s, above 0.15: left foot, frames 4-6'
+    """
 
     first: int
     last: int
@@ -45,7 +57,14 @@ class Fault:
 
 @dataclass(frozen=True)
 class Finding:
-    """The outcome of one check; `value` is None where it applies to no frame."""
+    """The outcome of one check; `value` is None where it applies to no frame.
+
+    Examples:
+        >>> from hdmi.motion import find_motion, load_motion
+        >>> report = validate_motion(load_motion(find_motion("walk")))
+        >>> report["missing_joints"].value, report["missing_joints"].verdict
+        (0.0, 'good')
+    """
 
     check: str
     verdict: Verdict
@@ -75,6 +94,12 @@ class Report:
 
     `verdict` is the worst of the findings': *good*, *usable* (tracking will have to make up for what the reasons name)
     or *bad*.
+
+    Examples:
+        >>> from hdmi.motion import find_motion, load_motion
+        >>> report = validate_motion(load_motion(find_motion("walk")))
+        >>> report.verdict, report.reasons, report.num_frames
+        ('good', (), 550)
     """
 
     motion: str
@@ -85,6 +110,7 @@ class Report:
 
     @property
     def verdict(self) -> Verdict:
+        """The worst of the findings'."""
         return _ORDER[max((_ORDER.index(finding.verdict) for finding in self.findings), default=0)]
 
     @property
@@ -109,6 +135,7 @@ class Report:
         }
 
     def to_json(self) -> str:
+        """Those values as JSON."""
         return json.dumps(self.as_dict(), indent=1, allow_nan=False)
 
     def table(self) -> Table:

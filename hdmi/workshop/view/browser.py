@@ -31,6 +31,16 @@ class ReferenceViewer:
 
     Raises:
         RenderingError: without viser.
+
+    Examples:
+        >>> from hdmi.motion import find_motion, load_motion, make_playback
+        >>> viewer = ReferenceViewer(make_playback(load_motion(find_motion("walk"))), port=8090)
+        ╭──... viser ...──╯
+        >>> viewer.show(100)
+        >>> viewer.address
+        'http://127.0.0.1:...'
+        >>> viewer.stop()
+        (viser) Server stopped
     """
 
     def __init__(self, playback: Playback, ghost: Playback | None = None, host: str = "127.0.0.1", port: int = 8080):
