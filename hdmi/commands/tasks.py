@@ -5,11 +5,11 @@
     hdmi tasks gallery [NAME ...] [out=docs/images/tasks] [motion_root=FOLDER] ...
 
 References are those that ship with the package, or those under `motion_root`. `config_dir` adds the tasks of its folder
-`task`. `check` builds each task, replays its
-reference to see whether end effectors meet the object where labels say, follows it without a policy and trains for
-`frames` control steps (0: does not), which has to improve the return of the policy with its exploration noise, if need
-be in a second training of twice as many, `jobs` tasks at a time on one processor each. Its exit status is 1 if a task fails. Without names it checks all tasks, with
-`motion_root` those that have a motion there. `gallery` renders each reference at mid-contact.
+`task`. `check` builds each task, replays its reference to see whether end effectors meet the object where labels say,
+follows it without a policy and trains for `frames` control steps (0: does not), which has to improve the return of the
+policy with its exploration noise, if need be in a second training of twice as many; `jobs` tasks at a time on one
+processor each. Its exit status is 1 if a task fails. Without names it checks all tasks, with `motion_root` those that
+have a motion there. `gallery` renders each reference at mid-contact.
 """
 
 from __future__ import annotations

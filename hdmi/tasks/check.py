@@ -188,8 +188,8 @@ def check_task(
         if not chance < _CHANCE:
             mean, middle = check.training.gain
             check.problems.append(
-                f"training of {cfg.total_frames} frames: the return changed by {mean:+.3f}, in the median by {middle:+.3f}; "
-                f"signed-rank test: p = {chance:.2g}, expected less than {_CHANCE:g}"
+                f"training of {cfg.total_frames} frames: the return changed by {mean:+.3f}, in the median by "
+                f"{middle:+.3f}; signed-rank test: p = {chance:.2g}, expected less than {_CHANCE:g}"
             )
     check.seconds = time.perf_counter() - start
     return check
