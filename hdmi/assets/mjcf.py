@@ -41,15 +41,14 @@ def mjcf_robot(path: str, feet: Sequence[str], keyframe: str | None = None, name
             an unknown foot or keyframe.
     """
     file = Path(path).expanduser().resolve()
-    try:
-        spec = _read(file)
+    spec = _read(file)
+    root_name = _root(spec, file).name
+    with _naming(file):
         model = spec.compile()
-    except (ValueError, OSError) as error:
-        raise ValueError(f"{file}: {' '.join(str(error).split())}") from error
-    root = model.body(_root(spec, file).name).id
+    root = model.body(root_name).id
     bodies = np.flatnonzero(model.body_rootid == root)
     joints = np.flatnonzero(np.isin(model.jnt_bodyid, bodies) & (model.jnt_type != mujoco.mjtJoint.mjJNT_FREE))
-    body_names = tuple(_named(file, model.body(b).name, f"a body of {model.body(root).name!r}") for b in bodies)
+    body_names = tuple(_named(file, model.body(b).name, f"a body of {root_name!r}") for b in bodies)
     joint_names = tuple(_named(file, model.joint(j).name, f"a joint of {body_names}") for j in joints)
     for j, joint in zip(joints, joint_names, strict=True):
         if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
@@ -91,8 +90,18 @@ def _named(file: Path, name: str, what: str) -> str:
 
 def _read(file: Path) -> mujoco.MjSpec:
     if not file.is_file():
-        raise ValueError("no such file")
-    return mujoco.MjSpec.from_file(str(file))
+        raise ValueError(f"{file}: no such file")
+    with _naming(file):
+        return mujoco.MjSpec.from_file(str(file))
+
+
+@contextmanager
+def _naming(file: Path) -> Iterator[None]:
+    """Makes MuJoCo's complaints one line that names the file."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{file}: {' '.join(str(error).split())}") from error
 
 
 def _root(spec: mujoco.MjSpec, file: Path) -> mujoco.MjsBody:
@@ -182,11 +191,10 @@ class _AddMjcf:
             for geom in body.geoms:
                 if not (geom.contype or geom.conaffinity):
                     continue
-                if body.name in boxes and geom.type == mujoco.mjtGeom.mjGEOM_SPHERE:
-                    own.delete(geom)
-                    continue
                 geom.contype, geom.conaffinity = ROBOT_BIT, ROBOT_BIT if config.self_collisions else 0
                 geom.friction[0] = config.friction
+                if body.name in boxes and geom.type == mujoco.mjtGeom.mjGEOM_SPHERE:
+                    geom.contype = geom.conaffinity = 0  # it still has its mass
             if body.name in boxes:
                 add_box_foot(body, boxes[body.name], f"{body.name}_box_collision", config)
         with _unprefixed():

@@ -47,7 +47,7 @@ def collision_kwargs(config: RobotConfig) -> dict[str, Any]:
 
 
 def add_box_foot(body: mujoco.MjsBody, foot: Foot, name: str, config: RobotConfig) -> None:
-    """Adds one box that spans the spheres of a foot."""
+    """Adds one box, without mass, that spans the spheres of a foot."""
     points = np.asarray(foot.points)
     low, high = points.min(0) - foot.radius, points.max(0) + foot.radius
     low[2], high[2] = points[0, 2] - foot.radius, points[0, 2] + _SOLE_HEIGHT
@@ -56,5 +56,6 @@ def add_box_foot(body: mujoco.MjsBody, foot: Foot, name: str, config: RobotConfi
         type=mujoco.mjtGeom.mjGEOM_BOX,
         pos=(low + high) / 2,
         size=(high - low) / 2,
+        mass=0.0,
         **collision_kwargs(config),
     )
