@@ -21,7 +21,9 @@ from hdmi.assembly import make_env, make_task, scene_parts
 from hdmi.assets import Effector, Robot, RobotConfig, SimConfig, build_scene, g1, g1_robot, mjcf_robot
 from hdmi.config import CONF, ConfigError
 from hdmi.learning import Trainer
-from hdmi.motion import MotionError, forward_kinematics, make_reference
+from hdmi.motion import MotionError, forward_kinematics, load_motion, make_reference
+from hdmi.workshop.annotate import annotate_motion
+from hdmi.workshop.validate import validate_motion
 
 FPS, T = 50.0, 40
 LEG = ("hip_{0}", "thigh_{0}", "shank_{0}", "foot_{0}")
@@ -125,7 +127,7 @@ def robot(lad: Path) -> Robot:
 
 
 def write_motion(folder: Path, lad: Path, box: bool = False) -> None:
-    """0.8 s of knee bends, turning slowly; kinematics by MuJoCo from the file. With `box` its forearms hold a box."""
+    """0.8 s of knee bends, turning slowly, by the kinematics of the file; with `box`, a box floats before the chest."""
     model = mujoco.MjModel.from_xml_path(str(lad))
     data = mujoco.MjData(model)
     pos, quat, angles = [], [], []
@@ -418,6 +420,12 @@ class TestMotion:
     def test_the_g1_does_not_know_it(self, folder: Path) -> None:
         with pytest.raises(MotionError, match=r"joint_names: \['hip_l_turn'"):
             make_reference(folder / "motions" / "bends", control_dt=0.02)
+
+    def test_is_annotated_but_not_judged(self, folder: Path, config) -> None:
+        motion, parts = load_motion(folder / "motions" / "parcel"), scene_parts(config("parcel"))
+        assert annotate_motion(motion, **parts).contact_points.shape == (T, 2, 3)
+        with pytest.raises(ConfigError, match=r"robot\.model: .* limits of the G1, not of lad\.xml"):
+            validate_motion(motion, **parts)
 
 
 class TestTraining:

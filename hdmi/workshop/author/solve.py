@@ -81,11 +81,14 @@ def author_motion(
         on_frame: called with the index of every frame of the last pass once it is solved, and their number.
 
     Raises:
-        PlanError: where the plan and the task do not fit together, or the plan is out of the robot's reach.
+        PlanError: where the plan and the task do not fit together, the plan is out of the robot's reach, or the robot
+            is another one than the G1.
         ImportError: without the extra `retarget`.
     """
     time = np.arange(round(plan.duration * FPS)) / FPS
     robot = robot or RobotConfig()
+    if robot.model != g1_robot():
+        raise PlanError(f"{plan.file}: plans are solved for the G1, and robot.model is {robot.model.name}")
     paths = _lay_out(plan, time, object, scenery, effectors)
     body = [*_foot_targets(paths), *_body_targets(plan, paths, robot)]
     hands, contact = _hand_targets(plan, paths, time, effectors, body, robot)
