@@ -15,12 +15,12 @@ from hdmi.assets import (
     Effector,
     GeomConfig,
     ObjectConfig,
+    Robot,
     RobotConfig,
     Scene,
     SceneryConfig,
     SimConfig,
     build_scene,
-    g1,
     match_names,
     parse_geom,
 )
@@ -84,7 +84,7 @@ def scene_parts(cfg: DictConfig) -> dict[str, Any]:
         for where, body in bodies:
             body.check(where)
         for i, effector in enumerate(parts["effectors"]):
-            effector.check(f"task.effectors[{i}]")
+            effector.check(f"task.effectors[{i}]", parts["robot"].model)
         _compile(**parts)
     except (ValueError, FileNotFoundError) as error:
         raise ConfigError(one_line(error)) from error
@@ -133,11 +133,17 @@ def _compile(robot: RobotConfig, object: ObjectConfig | None, scenery: Any, effe
 
 def _robot(cfg: DictConfig) -> RobotConfig:
     values = plain_container(cfg.robot)
+    # a config without it is one of a checkpoint from before robots could be chosen
+    node = values.pop("model", None) or {"_target_": "hdmi.assets.g1_robot"}
+    model = build(node, "robot.model")
+    if not isinstance(model, Robot):
+        raise ConfigError(f"robot.model: a robot expected, such as of hdmi.assets.g1_robot, got {node}")
+    values["model"] = model
     if (unactuated := values.pop("unactuated", "reference")) == "default":
         # what no pattern of the scale matches, the policy does not drive
         scale = "action.joint_position.scale"
-        driven = match_names(list(cfg.action.joint_position.scale), g1.JOINT_NAMES, scale)
-        values["held"] = [name for i, name in enumerate(g1.JOINT_NAMES) if i not in driven]
+        driven = match_names(list(cfg.action.joint_position.scale), model.joint_names, scale)
+        values["held"] = [name for i, name in enumerate(model.joint_names) if i not in driven]
     elif unactuated != "reference":
         raise ConfigError(f"robot.unactuated: expected 'reference' or 'default', got {unactuated!r}")
     robot: RobotConfig = build_dataclass(RobotConfig, values, "robot")
@@ -209,17 +215,18 @@ def _top(key: Any) -> str:
 
 def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
     """The transforms of a config with the names of their nodes, from the base environment outwards."""
+    robot = task.scene.robot
     context = {
-        "joint_names": g1.JOINT_NAMES,
-        "body_names": g1.BODY_NAMES,
-        "joint_ranges": g1.JOINT_RANGES,
-        "effort_limits": g1.EFFORT_LIMITS,
-        "feet": g1.FEET,
-        "robot_mass": g1.TOTAL_MASS,
+        "joint_names": robot.joint_names,
+        "body_names": robot.body_names,
+        "joint_ranges": robot.joint_ranges,
+        "effort_limits": robot.effort_limits,
+        "feet": robot.foot_bodies,
+        "robot_mass": robot.total_mass,
+        "default_pos": robot.default_joint_pos,
         "reference": task.reference,
         "starts": task.starts,
         "model": task.scene.model,
-        "default_pos": tuple(task.scene.default_qpos[task.scene.joint_qpos].tolist()),
         "robot_bodies": task.scene.body_ids.tolist(),
         "effectors": task.scene.effectors,
         "object_geoms": task.scene.object_geoms,

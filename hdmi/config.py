@@ -14,7 +14,7 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from hydra.utils import get_class
+from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
@@ -37,13 +37,13 @@ class ConfigError(ValueError):
 
 
 def build(node: Any, where: str, **context: Any) -> Any:
-    """Instantiates a config node `{_target_: class, parameter: value, ...}`; lists become tuples.
+    """Calls a config node `{_target_: class or function, parameter: value, ...}`; lists become tuples.
 
     Args:
-        context: values for parameters of the class that the node does not give.
+        context: values for parameters of the target that the node does not give.
 
     Raises:
-        ConfigError: for an unknown class or parameter, or values that the class refuses; names the node.
+        ConfigError: for an unknown target or parameter, or values that the target refuses; names the node.
     """
     try:
         values: dict[str, Any] = plain_container(node) if OmegaConf.is_config(node) else dict(node)
@@ -53,9 +53,11 @@ def build(node: Any, where: str, **context: Any) -> Any:
     if path is None:
         raise ConfigError(f"{where}: has no _target_")
     try:
-        cls = get_class(path)
+        cls: Any = get_object(path)
     except Exception as error:
         raise ConfigError(f"{where}: _target_ {path!r}: {error}") from error
+    if not callable(cls):
+        raise ConfigError(f"{where}: _target_ {path!r}: a class or function expected, got {type(cls).__name__}")
     kwargs = {key: _plain(value, f"{where}.{key}") for key, value in values.items()}
     parameters = inspect.signature(cls).parameters
     kwargs |= {key: value for key, value in context.items() if key in parameters and key not in kwargs}

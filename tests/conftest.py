@@ -14,7 +14,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene, default_joint_pos, g1
+from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene, default_joint_pos, g1, g1_robot
 from hdmi.motion import forward_kinematics
 
 settings.register_profile("hdmi", derandomize=True, deadline=None, max_examples=60)
@@ -45,7 +45,7 @@ def motion_arrays() -> dict[str, np.ndarray]:
         full[:, g1.JOINT_NAMES.index(name)] = joint_pos[:, i]
     root_pos = np.stack([0.5 * t, 0 * t, 0.76 + 0 * t], axis=-1)
     root_quat = np.tile([1.0, 0.0, 0.0, 0.0], (NUM_FRAMES, 1))
-    pos, quat = forward_kinematics(root_pos, root_quat, full)
+    pos, quat = forward_kinematics(g1_robot(), root_pos, root_quat, full)
     rows = [g1.BODY_NAMES.index(name) for name in BODIES[:-1]]
     box_pos = np.stack([1.0 + 0 * t, 0.2 * t, 0.3 + 0 * t], axis=-1)
     box_quat = np.stack([np.cos(0.4 * t), 0 * t, 0 * t, np.sin(0.4 * t)], axis=-1)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from hdmi.assets import default_joint_pos
+from hdmi.assets import default_joint_pos, g1_robot
 from hdmi.motion import forward_kinematics
 from hdmi.workshop.human import SMPL_JOINTS
 from hdmi.workshop.skeleton import UPRIGHT, anthropometric_skeleton
@@ -117,7 +117,7 @@ def robot_arrays(num_frames: int = T) -> dict[str, np.ndarray]:
     joint_pos = default_joint_pos() + 0.3 * np.sin(t[:, None] * 5 + np.arange(29))
     root = np.stack([0.5 * t, 0.1 * t, 0.76 + 0 * t], axis=-1)
     quat = Rotation.from_euler("z", 0.5 * t[:, None]).as_quat(scalar_first=True)
-    pos, body_quat = forward_kinematics(root, quat, joint_pos)
+    pos, body_quat = forward_kinematics(g1_robot(), root, quat, joint_pos)
     rng = np.random.default_rng(0)
     return {
         "joint_pos": joint_pos.astype(np.float32),

@@ -19,6 +19,7 @@ from hdmi.assets import (
     build_scene,
     default_joint_pos,
     g1,
+    g1_robot,
     match_names,
     per_joint,
 )
@@ -101,7 +102,7 @@ class TestRobot:
     def test_a_scene_moves_the_robot_as_forward_kinematics_does(self, robot_scene, pose):
         joint_pos = np.random.default_rng(0).uniform(-0.5, 0.5, 29)
         data = pose(robot_scene, joint_pos)
-        pos, quat = forward_kinematics(data.qpos[None, :3], data.qpos[None, 3:7], joint_pos[None])
+        pos, quat = forward_kinematics(g1_robot(), data.qpos[None, :3], data.qpos[None, 3:7], joint_pos[None])
         np.testing.assert_allclose(data.xpos[robot_scene.body_ids], pos[0], atol=1e-9)
         np.testing.assert_allclose(data.xquat[robot_scene.body_ids], quat[0], atol=1e-9)
 
@@ -184,7 +185,7 @@ class TestRobot:
     @pytest.mark.parametrize("collide", [False, True])
     def test_self_collisions_are_a_choice(self, collide, pose):
         scene = scene_with(robot=RobotConfig(self_collisions=collide))
-        crossed = per_joint({"left_hip_roll_joint": -0.5, "right_hip_roll_joint": 0.5})
+        crossed = per_joint({"left_hip_roll_joint": -0.5, "right_hip_roll_joint": 0.5}, g1.JOINT_NAMES)
         data = pose(scene, crossed, height=3.0)
         pairs = [{scene.model.geom(g).name.split("_")[0] for g in contact.geom} for contact in data.contact]
         assert ({"left", "right"} in pairs) == collide
@@ -207,7 +208,7 @@ class TestNames:
             match_names(["left_hip", "tail"], self.NAMES, where="task.bodies")
 
     def test_per_joint_last_pattern_wins(self):
-        values = per_joint({".*_hip_.*": 2.0, "left_hip_roll_joint": 3.0}, default=1.0)
+        values = per_joint({".*_hip_.*": 2.0, "left_hip_roll_joint": 3.0}, g1.JOINT_NAMES, default=1.0)
         assert values[g1.JOINT_NAMES.index("left_hip_roll_joint")] == 3.0
         assert values[g1.JOINT_NAMES.index("right_hip_roll_joint")] == 2.0
         assert values[g1.JOINT_NAMES.index("left_elbow_joint")] == 1.0

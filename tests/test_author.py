@@ -8,7 +8,7 @@ from mocks import load_config
 from scipy.spatial.transform import Rotation
 
 from hdmi.assembly import scene_parts
-from hdmi.assets import Effector, ObjectConfig, SceneryConfig, g1
+from hdmi.assets import Effector, ObjectConfig, SceneryConfig, g1, g1_robot
 from hdmi.motion import find_motion, forward_kinematics, load_motion
 from hdmi.motion.kinematics import minimum_jerk
 from hdmi.workshop import ik
@@ -289,7 +289,7 @@ class TestMotions:
 
     def test_feet_are_on_the_ground(self, authored):
         motion = authored.motion
-        pos, _ = forward_kinematics(motion.body_pos_w[:, 0], motion.body_quat_w[:, 0], motion.joint_pos)
+        pos, _ = forward_kinematics(g1_robot(), motion.body_pos_w[:, 0], motion.body_quat_w[:, 0], motion.joint_pos)
         feet = pos[:, [g1.BODY_NAMES.index(foot) for foot in g1.FEET]]
         assert feet[..., 2].min() > ANKLE_HEIGHT - 1e-3
         assert (feet[..., 2].min(axis=1) < ANKLE_HEIGHT + 1e-3).all()  # never both in the air
@@ -300,7 +300,7 @@ class TestMotions:
         assert motion.object_contact.all()
         box = motion.body_pos_w[:, motion.body_names.index("box")]
         assert box[-1, 0] == pytest.approx(0.45, abs=1e-3)
-        pos, quat = forward_kinematics(motion.body_pos_w[:, 0], motion.body_quat_w[:, 0], motion.joint_pos)
+        pos, quat = forward_kinematics(g1_robot(), motion.body_pos_w[:, 0], motion.body_quat_w[:, 0], motion.joint_pos)
         for effector, inside in zip(FINGERTIPS, ([0, -0.01, 0], [0, 0.01, 0]), strict=True):
             b = g1.BODY_NAMES.index(effector.body)
             point = pos[:, b] + Rotation.from_quat(quat[:, b], scalar_first=True).apply(effector.point)

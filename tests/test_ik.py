@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hdmi.assets import default_joint_pos, g1
+from hdmi.assets import default_joint_pos, g1, g1_robot
 from hdmi.motion import forward_kinematics
 from hdmi.workshop import ik
 from hdmi.workshop.ik import ComTarget, IkOptions, Obstacle, OrientationTarget, PointTarget, PostureTarget
@@ -32,7 +32,7 @@ def key_targets(pos: np.ndarray, quat: np.ndarray) -> list[ik.Target]:
 
 
 def feet() -> list[ik.Target]:
-    pos, quat = forward_kinematics(*(part[None] for part in np.split(ik.standing(), [3, 7])))
+    pos, quat = forward_kinematics(g1_robot(), *(part[None] for part in np.split(ik.standing(), [3, 7])))
     rows = [g1.BODY_NAMES.index(name) for name in g1.FEET]
     return [t for name, b in zip(g1.FEET, rows, strict=True) for t in ik.planted(name, pos[0, b], quat[0, b])]
 
@@ -46,7 +46,7 @@ def test_finds_the_joints_that_made_the_poses(seed: int):
     joints = np.clip(joints, low + 0.03, high - 0.03)[None]
     root = np.array([[0.3, -0.2, 0.8]])
     quat = np.array([[0.9, 0.1, -0.1, 0.4]]) / np.linalg.norm([0.9, 0.1, -0.1, 0.4])
-    targets = key_targets(*forward_kinematics(root, quat, joints))
+    targets = key_targets(*forward_kinematics(g1_robot(), root, quat, joints))
     result = ik.solve(targets, 1, FPS, options=IkOptions(self_collision=None))
     np.testing.assert_allclose(result.joint_pos, joints, atol=2e-3)
     np.testing.assert_allclose(result.root_pos, root, atol=1e-4)
@@ -60,7 +60,7 @@ def test_planted_feet_stay_while_hands_and_centre_of_mass_move():
     result = ik.solve([*feet(), hand, ComTarget([0.03, 0.0, 0.0], [10.0, 10.0, 0.0]), STAY], 20, FPS)
     assert np.nanmax(result.residuals["left_ankle_roll_link planted"]) < 2e-4
     assert np.nanmax(result.residuals["fingertip"][5:]) < 5e-3
-    pos, quat = forward_kinematics(result.root_pos, result.root_quat, result.joint_pos)
+    pos, quat = forward_kinematics(g1_robot(), result.root_pos, result.root_quat, result.joint_pos)
     data = mujoco.MjData(model := ik._bare_model(True, None))
     data.qpos[:] = result.qpos[-1]
     mujoco.mj_kinematics(model, data)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from hdmi.assets import Effector, HingeConfig, ObjectConfig, SceneryConfig, g1
+from hdmi.assets import Effector, HingeConfig, ObjectConfig, SceneryConfig, g1, g1_robot
 from hdmi.motion import MotionError, find_motion, forward_kinematics, load_motion, make_reference, save_motion
 from hdmi.motion.complete import resample
 from hdmi.motion.kinematics import angular_velocity, derivative
@@ -273,7 +273,10 @@ class TestReference:
     def test_bodies_that_the_motion_lacks_come_from_forward_kinematics(self, write_motion, motion_arrays):
         reference = make_reference(write_motion(), control_dt=0.02)
         pos, _ = forward_kinematics(
-            motion_arrays["body_pos_w"][:, 0], motion_arrays["body_quat_w"][:, 0], reference.joint_pos.numpy()
+            g1_robot(),
+            motion_arrays["body_pos_w"][:, 0],
+            motion_arrays["body_quat_w"][:, 0],
+            reference.joint_pos.numpy(),
         )
         np.testing.assert_allclose(reference.body_pos, pos, atol=1e-5)
         foot = g1.BODY_NAMES.index("right_ankle_roll_link")
@@ -439,7 +442,7 @@ class TestPublicMotions:
         # 0.2 s apart: enough to see every pose, a fifth of the time
         frames = slice(None, None, 10)
         pos, _ = forward_kinematics(
-            motion.body_pos_w[frames, root], motion.body_quat_w[frames, root], joint_pos[frames]
+            g1_robot(), motion.body_pos_w[frames, root], motion.body_quat_w[frames, root], joint_pos[frames]
         )
         shared = [body for body in g1.BODY_NAMES if body in motion.body_names]
         assert len(shared) >= 28

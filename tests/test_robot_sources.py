@@ -22,7 +22,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from sources import write_mjlab_file
 
-from hdmi.assets import HingeConfig, ObjectConfig, default_joint_pos, g1
+from hdmi.assets import HingeConfig, ObjectConfig, default_joint_pos, g1, g1_robot
 from hdmi.motion import Motion, MotionError, forward_kinematics, load_motion, make_reference, save_motion
 from hdmi.motion.complete import is_finger_joint
 from hdmi.motion.format import motion_from_poses
@@ -76,7 +76,7 @@ def write_csv(path: Path, rows: np.ndarray, **options: Any) -> Path:
 
 def walking(heading: float = 0.0) -> Motion:
     pos, quat = pose(heading)
-    body_pos, body_quat = forward_kinematics(pos, quat, angles())
+    body_pos, body_quat = forward_kinematics(g1_robot(), pos, quat, angles())
     return motion_from_poses("walk", 50.0, g1.BODY_NAMES, g1.JOINT_NAMES, body_pos, body_quat, angles())
 
 
@@ -130,7 +130,7 @@ class TestOrderOfQuaternions:
     @pytest.mark.parametrize("axis", ["x", "y"])
     def test_a_robot_in_a_motion_folder_may_lie_on_something(self, tmp_path: Path, axis: str) -> None:
         pos, quat = pose(0, Rotation.from_euler(axis, -90, degrees=True), height=0.8)
-        body_pos, body_quat = forward_kinematics(pos, quat, angles())
+        body_pos, body_quat = forward_kinematics(g1_robot(), pos, quat, angles())
         motion = motion_from_poses("bed", 50.0, g1.BODY_NAMES, g1.JOINT_NAMES, body_pos, body_quat, angles())
         taken, _, _ = convert(save_motion(motion, tmp_path / "bed"), tmp_path / "same", "hdmi")
         np.testing.assert_array_equal(taken.body_quat_w, motion.body_quat_w)
@@ -466,7 +466,7 @@ class TestJoints:
         lacking = [i for i, name in enumerate(g1.JOINT_NAMES) if name not in names]
         full = angles()
         full[:, lacking] = default_joint_pos()[lacking]
-        expected, _ = forward_kinematics(*pose(), full)
+        expected, _ = forward_kinematics(g1_robot(), *pose(), full)
         np.testing.assert_allclose(motion.body_pos_w, expected, atol=1e-5)
 
     def test_unitrees_23(self, tmp_path: Path) -> None:
@@ -730,7 +730,7 @@ class TestPickles:
         names = LAYOUTS[layout]
         full = np.tile(default_joint_pos(), (T, 1))
         full[:, [g1.JOINT_NAMES.index(name) for name in names]] = angles(names)
-        local, _ = forward_kinematics(np.zeros((T, 3)), np.tile([1.0, 0, 0, 0], (T, 1)), full)
+        local, _ = forward_kinematics(g1_robot(), np.zeros((T, 3)), np.tile([1.0, 0, 0, 0], (T, 1)), full)
         content = gmr(walking()) | {"dof_pos": angles(names)}
         content |= {"local_body_pos": local.astype(np.float32), "link_body_list": list(g1.BODY_NAMES)}
         (tmp_path / "a.pkl").write_bytes(pickle.dumps(content))

@@ -20,7 +20,7 @@ from sources import (
     write_omomo,
 )
 
-from hdmi.assets import g1
+from hdmi.assets import g1, g1_robot
 from hdmi.motion import MotionError, load_motion, save_motion
 from hdmi.workshop.human import SMPL_JOINTS
 from hdmi.workshop.skeleton import UPRIGHT, anthropometric_skeleton
@@ -408,7 +408,7 @@ class TestHolosoma:
         with np.load(path) as file:
             qpos, qvel = file["joint_pos"].astype(float), file["joint_vel"].astype(float)
         step = qpos[0].copy()
-        mujoco.mj_integratePos(robot_model(), step, qvel[0], 1 / fps)
+        mujoco.mj_integratePos(robot_model(g1_robot()), step, qvel[0], 1 / fps)
         np.testing.assert_allclose(step[:7], qpos[1, :7], atol=1e-5)
 
     def test_refuses(self, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, check_env_specs, exploration_type
 
 from hdmi.assembly import Task, make_env, make_task, make_transforms, scene_parts
-from hdmi.assets import default_joint_pos, g1
+from hdmi.assets import default_joint_pos, g1, g1_robot
 from hdmi.config import ConfigError, task_files
 from hdmi.evaluation.agents import BlindAgent
 from hdmi.motion import Motion, find_motion, forward_kinematics, load_motion, save_motion
@@ -272,7 +272,7 @@ class TestCheck:
         cfg = load_config("task=lift_box", "task.scenery=[]", f"motion_root={tmp_path}")
         point = np.array(cfg.task.effectors[0].point)
         pos, quat = forward_kinematics(
-            np.array([[0, 0, g1.ROOT_HEIGHT]]), np.array([[1.0, 0, 0, 0]]), default_joint_pos()[None]
+            g1_robot(), np.array([[0, 0, g1.ROOT_HEIGHT]]), np.array([[1.0, 0, 0, 0]]), default_joint_pos()[None]
         )
         hand = g1.BODY_NAMES.index("left_wrist_yaw_link")
         turned = np.zeros(3)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hdmi.assembly import scene_parts
-from hdmi.assets import Effector, ObjectConfig, default_joint_pos, g1
+from hdmi.assets import Effector, ObjectConfig, default_joint_pos, g1, g1_robot
 from hdmi.commands import validate
 from hdmi.config import task_config
 from hdmi.motion import Motion, find_motion, forward_kinematics, load_motion, make_playback, robot_model, save_motion
@@ -39,14 +39,14 @@ def moved(
     for name, angle in (joints or {}).items():
         joint_pos[:, g1.JOINT_NAMES.index(name)] = angle
     root_pos, root_quat = np.zeros((T, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (T, 1))
-    feet, _ = forward_kinematics(root_pos[:1], root_quat[:1], standing[None])
+    feet, _ = forward_kinematics(g1_robot(), root_pos[:1], root_quat[:1], standing[None])
     root_pos[:, 2] = g1.FOOT_POINT_RADIUS - g1.FOOT_POINTS[0][2] - feet[0, g1.BODY_NAMES.index(g1.FEET[0]), 2] + z
     root_pos[:, 0] = x
     return from_qpos(root_pos, root_quat, joint_pos)
 
 
 def from_qpos(root_pos: np.ndarray, root_quat: np.ndarray, joint_pos: np.ndarray) -> Motion:
-    pos, quat = forward_kinematics(root_pos, root_quat, joint_pos)
+    pos, quat = forward_kinematics(g1_robot(), root_pos, root_quat, joint_pos)
     return motion_from_poses("made", FPS, g1.BODY_NAMES, g1.JOINT_NAMES, pos, quat, joint_pos)
 
 
@@ -208,7 +208,7 @@ class TestRobot:
 
     def test_velocities_of_centres_of_mass_are_velocities(self):
         motion = moved(joints={"left_hip_pitch_joint": 0.8 * np.sin(np.arange(T) / 8)})
-        model, com = robot_model(), np.empty((T, len(g1.BODY_NAMES), 3))
+        model, com = robot_model(g1_robot()), np.empty((T, len(g1.BODY_NAMES), 3))
         data = mujoco.MjData(model)
         for t in range(T):
             data.qpos[:] = [*motion.body_pos_w[t, PELVIS], *motion.body_quat_w[t, PELVIS], *motion.joint_pos[t]]
@@ -230,7 +230,7 @@ class TestRobot:
         for side in ("left", "right"):
             joint_pos[:, g1.JOINT_NAMES.index(f"{side}_ankle_pitch_joint")] -= lean
         motion = from_qpos(root_pos, root_quat, joint_pos)
-        model = robot_model()
+        model = robot_model(g1_robot())
         data = mujoco.MjData(model)
         data.qpos[:] = [*root_pos[0], *root_quat[0], *joint_pos[0]]
         mujoco.mj_kinematics(model, data)

@@ -6,7 +6,6 @@ quaternions wxyz; inertias are principal moments in the frame `com_quat` at the 
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 Vec = tuple[float, ...]
@@ -486,16 +485,10 @@ FOOT_POINTS: tuple[Vec, ...] = (
 )
 FOOT_POINT_RADIUS = 0.005
 
-NATURAL_FREQUENCY = 2 * math.pi * 10.0  # of the joint servos, rad/s
-DAMPING_RATIO = 2.0
+HANDS: tuple[str, ...] = ("left_wrist_yaw_link", "right_wrist_yaw_link")
 
 BODY_NAMES: tuple[str, ...] = tuple(body.name for body in BODIES)
 JOINT_NAMES: tuple[str, ...] = tuple(joint.name for joint in JOINTS)
 JOINT_RANGES: tuple[Vec, ...] = tuple(joint.range for joint in JOINTS)
 EFFORT_LIMITS: Vec = tuple(joint.effort_limit for joint in JOINTS)
 TOTAL_MASS = sum(body.mass for body in BODIES)  # kg
-
-
-def servo_gains(armature: float) -> tuple[float, float]:
-    """Stiffness (N m/rad) and damping (N m s/rad) of a 10 Hz servo with damping ratio 2."""
-    return armature * NATURAL_FREQUENCY**2, 2 * DAMPING_RATIO * armature * NATURAL_FREQUENCY

@@ -9,9 +9,9 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from hdmi.assets import g1
 from hdmi.assets.objects import ObjectConfig, SceneryConfig, add_object, add_scenery, check_numbers
-from hdmi.assets.robot import ROBOT_BIT, WORLD_BIT, RobotConfig, add_robot
+from hdmi.assets.robot import ROBOT_BIT, WORLD_BIT, Robot
+from hdmi.assets.robot_config import RobotConfig, add_robot
 
 Pose = tuple[Sequence[float], Sequence[float]]
 _MINDIST, _NETFORCE = 1, 3  # contact sensor reductions: the deepest contact; the sum of all, in the world frame
@@ -75,10 +75,10 @@ class Effector:
     target: Sequence[float] = (0.0, 0.0, 0.0)
     press: float = 0.0
 
-    def check(self, where: str) -> None:
-        """Raises a ValueError that names the field for what cannot be used."""
-        if self.body not in g1.BODY_NAMES:
-            raise ValueError(f"{where}.body: robot has no body {self.body!r}; it has {', '.join(g1.BODY_NAMES)}")
+    def check(self, where: str, robot: Robot) -> None:
+        """Raises a ValueError that names the field for what cannot be used, or is not of the robot."""
+        if self.body not in robot.body_names:
+            raise ValueError(f"{where}.body: robot has no body {self.body!r}; it has {', '.join(robot.body_names)}")
         check_numbers(self.point, 3, f"{where}.point")
         check_numbers(self.target, 3, f"{where}.target")
         check_numbers(self.press, 1, f"{where}.press")
@@ -101,12 +101,13 @@ class Scene:
     model: mujoco.MjModel
     xml: str  # MJCF of the model, for other programs
     sim: SimConfig
+    robot: Robot  # with the servos and default pose of its config
     effectors: tuple[Effector, ...]
     default_qpos: np.ndarray  # [nq] standing robot, object where it was placed
     body_ids: np.ndarray  # [B] robot bodies in table order
     joint_qpos: np.ndarray  # [J] addresses
     joint_dof: np.ndarray  # [J]
-    foot_sensors: np.ndarray  # [2, 3] addresses in sensordata
+    foot_sensors: np.ndarray  # [F, 3] addresses in sensordata
     effector_sensors: np.ndarray  # [E, 3]
     penetration_sensor: int | None  # address of the smallest distance of the object's contacts, m; 0 without contact
     scenery_bodies: np.ndarray  # [S] ids
@@ -142,15 +143,16 @@ def build_scene(
     """
     placements = placements or {}
     for effector in effectors:
-        if effector.body not in g1.BODY_NAMES:
-            raise ValueError(f"effectors: robot has no body {effector.body!r}; it has {list(g1.BODY_NAMES)}")
+        if effector.body not in robot.model.body_names:
+            raise ValueError(f"effectors: robot has no body {effector.body!r}; it has {list(robot.model.body_names)}")
     if effectors and object is None:
         raise ValueError("effectors: the task has no object to touch")
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     _set_options(spec, sim)
     _add_floor(spec)
-    add_robot(spec, robot)
+    spec = add_robot(spec, robot)
+    record = robot.robot
     for actuator in spec.actuators:
         actuator.nsample = sim.decimation  # room for a control per physics step; no delay
     if object is not None:
@@ -162,14 +164,14 @@ def build_scene(
             add_scenery(spec, item, item.pos, item.quat)
         else:
             raise ValueError(f"scenery {item.name!r}: the reference has no body of that name; give it a pos")
-    _add_contact_sensors(spec, object, effectors)
+    _add_contact_sensors(spec, record, object, effectors)
     model = spec.compile()
 
-    joint_ids = [model.joint(name).id for name in g1.JOINT_NAMES]
+    joint_ids = [model.joint(name).id for name in record.joint_names]
     # not in model.qpos0: hinges turn by qpos - qpos0
     default_qpos = model.qpos0.copy()
-    default_qpos[2] = g1.ROOT_HEIGHT
-    default_qpos[model.jnt_qposadr[joint_ids]] = robot.default_joint_pos
+    default_qpos[2] = record.root_height
+    default_qpos[model.jnt_qposadr[joint_ids]] = record.default_joint_pos
     link = None if object is None else model.body(object.link).id
     hinge = None if object is None or object.hinge is None else model.joint(object.hinge.name).id
     free = None if object is None or object.fixed_base else model.joint("object_root").id
@@ -178,12 +180,13 @@ def build_scene(
         model=model,
         xml=spec.to_xml(),
         sim=sim,
+        robot=record,
         effectors=tuple(effectors),
         default_qpos=default_qpos,
-        body_ids=np.array([model.body(name).id for name in g1.BODY_NAMES]),
+        body_ids=np.array([model.body(name).id for name in record.body_names]),
         joint_qpos=model.jnt_qposadr[joint_ids].copy(),
         joint_dof=model.jnt_dofadr[joint_ids].copy(),
-        foot_sensors=_sensor_addresses(model, [f"{foot}_force" for foot in g1.FEET]),
+        foot_sensors=_sensor_addresses(model, [f"{foot}_force" for foot in record.foot_bodies]),
         effector_sensors=_sensor_addresses(model, [f"effector{i}_force" for i in range(len(effectors))]),
         penetration_sensor=None if object is None else int(model.sensor("object_penetration").adr[0]),
         scenery_bodies=np.array([model.body(item.name).id for item in scenery], dtype=int),
@@ -255,7 +258,9 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
     )  # fmt: skip
 
 
-def _add_contact_sensors(spec: mujoco.MjSpec, object: ObjectConfig | None, effectors: Sequence[Effector]) -> None:
+def _add_contact_sensors(
+    spec: mujoco.MjSpec, robot: Robot, object: ObjectConfig | None, effectors: Sequence[Effector]
+) -> None:
     force = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
     common = {"type": mujoco.mjtSensor.mjSENS_CONTACT, "intprm": [force, _NETFORCE, 1]}
     if object is not None:
@@ -266,7 +271,7 @@ def _add_contact_sensors(spec: mujoco.MjSpec, object: ObjectConfig | None, effec
             objname=object.name,
             intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_DIST), _MINDIST, 1],
         )
-    for foot in g1.FEET:
+    for foot in robot.foot_bodies:
         spec.add_sensor(name=f"{foot}_force", objtype=mujoco.mjtObj.mjOBJ_BODY, objname=foot, **common)
     for i, effector in enumerate(effectors):
         assert object is not None

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.custom.mujoco.base import MujocoEnv
 
-from hdmi.assets import Scene, default_joint_pos
+from hdmi.assets import Scene
 
 _MJLAB = Path(__file__).with_name("benchmark_mjlab.py")
 
@@ -22,7 +22,7 @@ _MJLAB = Path(__file__).with_name("benchmark_mjlab.py")
 class SceneEnv(MujocoEnv):
     """A scene in TorchRL's own MuJoCo environment: no reward and no task, as in `HumanoidObjectEnv`.
 
-    Action: joint position targets, rad. [1, 29]; observation: generalised positions and velocities.
+    Action: joint position targets, rad. [1, J]; observation: generalised positions and velocities.
 
     Args:
         scene: which; the other arguments are `MujocoEnv`'s.
@@ -54,7 +54,7 @@ def mujoco_env_speed(scene: Scene, num_envs: int, steps: int) -> float:
         steps: control steps, under random targets about the default pose.
     """
     env: EnvBase = SceneEnv(scene=scene, backend="mujoco", num_envs=num_envs, max_episode_steps=100, seed=0)
-    pose = torch.from_numpy(default_joint_pos()).float()
+    pose = torch.tensor(scene.robot.default_joint_pos)
     generator = torch.Generator().manual_seed(0)
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:

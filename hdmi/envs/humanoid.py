@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded, UnboundedDiscrete
 from torchrl.envs import EnvBase
 
-from hdmi.assets import Scene, g1
+from hdmi.assets import Scene
 from hdmi.envs.backend import BatchBackend, PhysicsBackend, assign
 from hdmi.envs.rendering import WorldRenderer
 from hdmi.functional import body_velocity, quat_apply_inverse
@@ -29,15 +29,15 @@ class HumanoidObjectEnv(EnvBase):
     is until it is reset (and counts it in every step until then); others put it back into the default state at once.
 
     Action:
-        `action`: joint position targets, rad. [N, 29], held for the control step; or [N, S, 29], one after
+        `action`: joint position targets, rad. [N, J], held for the control step; or [N, S, J], one after
         another for decimation / S physics steps each. Optionally `push` [N, 6]: linear (m/s) and angular (rad/s)
         world velocity to add to the root first.
 
-    Writes (float32, world frame, quaternions wxyz; B = 30 bodies, K object joints, E effectors):
-        `robot/{joint_pos, joint_vel, joint_torque, joint_target}` [N, 29];
+    Writes (float32, world frame, quaternions wxyz; J joints, B bodies, F feet, K object joints, E effectors):
+        `robot/{joint_pos, joint_vel, joint_torque, joint_target}` [N, J];
         `robot/{root_pos, root_lin_vel, root_ang_vel}` [N, 3]; `robot/root_quat` [N, 4];
         `robot/{body_pos, body_lin_vel, body_ang_vel}` [N, B, 3]; `robot/body_quat` [N, B, 4];
-        `robot/foot_force` [N, 2, 3], N, on the feet;
+        `robot/foot_force` [N, F, 3], N, on the feet;
         with an object: `object/{pos, lin_vel, ang_vel, link_pos}` [N, 3], `object/{quat, link_quat}` [N, 4] (the
         link carries the contact points; for a rigid object it is the object), `object/{joint_pos, joint_vel}`
         [N, K], `object/{scale, mass, friction}` [N, 1]; `contact/force` [N, E, 3], N, of the object on the effectors;
@@ -130,7 +130,7 @@ class HumanoidObjectEnv(EnvBase):
 
     def _make_specs(self) -> None:
         n, scene = self.num_envs, self.scene
-        joints, bodies, effectors = len(g1.JOINT_NAMES), len(g1.BODY_NAMES), len(scene.effectors)
+        joints, bodies, effectors = len(scene.joint_dof), len(scene.body_ids), len(scene.effectors)
 
         def unbounded(*shape: int) -> Unbounded:
             return Unbounded(shape=(n, *shape), device=self.device, dtype=torch.float32)
@@ -138,7 +138,11 @@ class HumanoidObjectEnv(EnvBase):
         robot = {key: unbounded(joints) for key in ("joint_pos", "joint_vel", "joint_torque", "joint_target")}
         robot |= {key: unbounded(bodies, 3) for key in ("body_pos", "body_lin_vel", "body_ang_vel")}
         robot |= {key: unbounded(3) for key in ("root_pos", "root_lin_vel", "root_ang_vel")}
-        robot |= {"body_quat": unbounded(bodies, 4), "root_quat": unbounded(4), "foot_force": unbounded(2, 3)}
+        robot |= {
+            "body_quat": unbounded(bodies, 4),
+            "root_quat": unbounded(4),
+            "foot_force": unbounded(len(scene.foot_sensors), 3),
+        }
         spec: dict[str, object] = {"robot": Composite(robot, shape=(n,))}
         if scene.object_body is not None:
             k = scene.num_object_joints
@@ -168,7 +172,7 @@ class HumanoidObjectEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
-        targets = action.unsqueeze(-2) if action.ndim == 2 else action  # [N, S, 29]
+        targets = action.unsqueeze(-2) if action.ndim == 2 else action  # [N, S, J]
         decimation, count = self.scene.sim.decimation, targets.shape[-2]
         if decimation % count:
             raise ValueError(f"action: {count} targets per control step do not divide the decimation {decimation}")
@@ -390,7 +394,7 @@ class HumanoidObjectEnv(EnvBase):
             RuntimeError: if no rendering back end works; says what to install.
         """
         if self._renderer is None:
-            self._renderer = WorldRenderer(self.scene.model, height, width)
+            self._renderer = WorldRenderer(self.scene.model, self.scene.robot, height, width)
         model, data = self.backend.world(index)
         return self._renderer(model, data, height, width)
 

@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 from mujoco.rendering.classic import gl_context
 
+from hdmi.assets import Robot
+
 _HELP = (
     "no OpenGL for rendering ({error}). Headless Linux: install EGL (Debian: apt-get install libegl1 libgl1-mesa-dri) "
     "and leave MUJOCO_GL unset or set it to egl; with a display: MUJOCO_GL=glfw"
@@ -42,22 +44,29 @@ def _make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Ren
         raise RuntimeError(_HELP.format(error=error)) from error
 
 
-def look_at(data: mujoco.MjData) -> np.ndarray:
-    """Where a camera looks that follows the robot: steadily at standing height, higher where the robot climbs. [3]"""
-    x, y, z = data.body("pelvis").xpos
-    return np.array([x, y, max(0.75, z - 0.1)])
+def look_at(data: mujoco.MjData, robot: Robot) -> np.ndarray:
+    """Where a camera looks that follows a robot: steadily at standing height, higher where the robot climbs. [3]"""
+    x, y, z = data.body(robot.root).xpos
+    return np.array([x, y, max(robot.root_height - 0.01, z - 0.1)])
 
 
 class WorldRenderer:
-    """Renders worlds of one model with a camera that follows the robot's pelvis.
+    """Renders worlds of one model with a camera that follows the robot's root.
 
     Raises:
         RuntimeError: if no rendering back end works; says what to install. For pictures of no size, or too large.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, height: int = 480, width: int = 640, distance: float = 2.8, azimuth: float = 130.0
+        self,
+        model: mujoco.MjModel,
+        robot: Robot,
+        height: int = 480,
+        width: int = 640,
+        distance: float = 2.8,
+        azimuth: float = 130.0,
     ):
+        self._robot = robot
         self._renderer = _make_renderer(model, height, width)
         self._size = (height, width)
         self._camera = mujoco.MjvCamera()
@@ -100,7 +109,7 @@ class WorldRenderer:
         return np.bincount(ids[kinds == mujoco.mjtObj.mjOBJ_GEOM], minlength=model.ngeom)
 
     def _update(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        self._camera.lookat[:] = look_at(data)
+        self._camera.lookat[:] = look_at(data, self._robot)
         # of the model that is given, not the one that the renderer was made with: worlds differ in size
         catmask = int(mujoco.mjtCatBit.mjCAT_ALL)
         mujoco.mjv_updateScene(model, data, self._option, None, self._camera, catmask, self._renderer.scene)

@@ -19,6 +19,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
 from hdmi.assembly import Task, make_task
+from hdmi.assets import Robot
 from hdmi.envs.rendering import WorldRenderer, look_at
 from hdmi.evaluation.protocol import (
     Policy,
@@ -229,7 +230,7 @@ def write_video(
         for moment in moments:
             if renderer is None:
                 # the model of the world, not of the scene: objects are randomized in size
-                renderer = _renderer(moment.model, size)
+                renderer = _renderer(moment.model, overlay.task.scene.robot, size)
                 writer = imageio.get_writer(partial, fps=fps, codec="libx264", quality=8, macro_block_size=16)
             assert writer is not None
             writer.append_data(picture(renderer, moment, overlay, size))
@@ -246,9 +247,9 @@ def write_video(
     return path
 
 
-def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> WorldRenderer:
+def _renderer(model: mujoco.MjModel, robot: Robot, size: tuple[int, int]) -> WorldRenderer:
     try:
-        return WorldRenderer(model, *size)
+        return WorldRenderer(model, robot, *size)
     except RuntimeError as error:
         raise RenderingError(str(error)) from error
 
@@ -285,7 +286,7 @@ def show(moments: Iterable[Moment], overlay: Overlay, control_dt: float) -> None
             with window.lock():
                 data.qpos[:], data.qvel[:], data.ctrl[:] = moment.data.qpos, moment.data.qvel, moment.data.ctrl
                 mujoco.mj_forward(moment.model, data)
-                window.cam.lookat[:] = look_at(data)
+                window.cam.lookat[:] = look_at(data, overlay.task.scene.robot)
                 window.user_scn.ngeom = 0
                 overlay.draw(moment, window.user_scn)
             window.sync()

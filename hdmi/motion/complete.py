@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from hdmi.assets import RobotConfig, g1
+from hdmi.assets import RobotConfig
 from hdmi.motion.check import checked_fps
 from hdmi.motion.format import Motion, MotionError
 from hdmi.motion.kinematics import (
@@ -31,18 +31,18 @@ _FINGER_JOINT = re.compile(
 
 
 def is_finger_joint(name: str) -> bool:
-    """Whether a joint is called as those of hands are that the robot lacks, such as `left_hand_thumb_0_joint`."""
+    """Whether a joint is called as those of hands with fingers are, such as `left_hand_thumb_0_joint`."""
     plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
-    return name not in g1.JOINT_NAMES and _FINGER_JOINT.fullmatch(plain) is not None
+    return _FINGER_JOINT.fullmatch(plain) is not None
 
 
-def without_fingers(motion: Motion, keep: str | None = None) -> Motion:
+def without_fingers(motion: Motion, keep: Collection[str | None]) -> Motion:
     """The motion without joints of hands, which the robot lacks; warns if there are any.
 
     Args:
-        keep: a joint that stays, whatever it is called: the object's hinge.
+        keep: joints that stay, whatever they are called: the robot's, and the object's hinge.
     """
-    fingers = [name for name in motion.joint_names if name != keep and is_finger_joint(name)]
+    fingers = [name for name in motion.joint_names if name not in keep and is_finger_joint(name)]
     if not fingers:
         return motion
     warnings.warn(f"motion {motion.name!r}: joints of hands are dropped: {', '.join(fingers)}", stacklevel=3)
@@ -50,49 +50,50 @@ def without_fingers(motion: Motion, keep: str | None = None) -> Motion:
 
 
 def complete_robot(motion: Motion, robot: RobotConfig | None = None) -> Motion:
-    """The motion with all joints and bodies of the robot table, first and in its order; others follow.
+    """The motion with all joints and bodies of the robot, first and in its order; others follow.
 
     Joints that it lacks or that the robot holds there are at the default pose; bodies that it lacks or that these move
     come from forward kinematics.
 
     Raises:
-        MotionError: if it lacks the pelvis, or has no joint of the robot.
+        MotionError: if it lacks the robot's root, or has no joint of the robot.
     """
     where = f"motion {motion.name!r}"
-    if "pelvis" not in motion.body_names:
-        raise MotionError(f"{where}: body_names lacks the root 'pelvis'")
-    if not any(name in g1.JOINT_NAMES for name in motion.joint_names):
+    robot = robot or RobotConfig()
+    model = robot.model
+    if model.root not in motion.body_names:
+        raise MotionError(f"{where}: body_names lacks the root {model.root!r}")
+    if not any(name in model.joint_names for name in motion.joint_names):
         raise MotionError(f"{where}: joint_names has no joint of the robot")
     fps, num_frames = motion.fps, motion.num_frames
-    robot = robot or RobotConfig()
     held = robot.held_joints
     joint_pos = np.tile(robot.default_joint_pos, (num_frames, 1))
     joint_vel = np.zeros_like(joint_pos)
     for i, name in enumerate(motion.joint_names):
-        if name in g1.JOINT_NAMES and name not in held:
-            j = g1.JOINT_NAMES.index(name)
+        if name in model.joint_names and name not in held:
+            j = model.joint_names.index(name)
             joint_pos[:, j], joint_vel[:, j] = motion.joint_pos[:, i], motion.joint_vel[:, i]
 
-    root = motion.body_names.index("pelvis")
-    pos, quat = forward_kinematics(motion.body_pos_w[:, root], motion.body_quat_w[:, root], joint_pos)
+    root = motion.body_names.index(model.root)
+    pos, quat = forward_kinematics(model, motion.body_pos_w[:, root], motion.body_quat_w[:, root], joint_pos)
     lin_vel, ang_vel = derivative(pos, fps), angular_velocity(quat, fps)
-    moved = _bodies_after(held)
-    for b, name in enumerate(g1.BODY_NAMES):
+    moved = model.bodies_after(held)
+    for b, name in enumerate(model.body_names):
         if name in motion.body_names and name not in moved:
             i = motion.body_names.index(name)
             pos[:, b], quat[:, b] = motion.body_pos_w[:, i], motion.body_quat_w[:, i]
             lin_vel[:, b], ang_vel[:, b] = motion.body_lin_vel_w[:, i], motion.body_ang_vel_w[:, i]
 
-    joints = [i for i, name in enumerate(motion.joint_names) if name not in g1.JOINT_NAMES]
-    bodies = [i for i, name in enumerate(motion.body_names) if name not in g1.BODY_NAMES]
+    joints = [i for i, name in enumerate(motion.joint_names) if name not in model.joint_names]
+    bodies = [i for i, name in enumerate(motion.body_names) if name not in model.body_names]
 
     def joined(table: np.ndarray, others: np.ndarray) -> np.ndarray:
         return np.concatenate([table.astype(np.float32), others], axis=1)
 
     return replace(
         motion,
-        joint_names=(*g1.JOINT_NAMES, *(motion.joint_names[i] for i in joints)),
-        body_names=(*g1.BODY_NAMES, *(motion.body_names[i] for i in bodies)),
+        joint_names=(*model.joint_names, *(motion.joint_names[i] for i in joints)),
+        body_names=(*model.body_names, *(motion.body_names[i] for i in bodies)),
         joint_pos=joined(joint_pos, motion.joint_pos[:, joints]),
         joint_vel=joined(joint_vel, motion.joint_vel[:, joints]),
         body_pos_w=joined(pos, motion.body_pos_w[:, bodies]),
@@ -100,15 +101,6 @@ def complete_robot(motion: Motion, robot: RobotConfig | None = None) -> Motion:
         body_lin_vel_w=joined(lin_vel, motion.body_lin_vel_w[:, bodies]),
         body_ang_vel_w=joined(ang_vel, motion.body_ang_vel_w[:, bodies]),
     )
-
-
-def _bodies_after(joints: Sequence[str]) -> set[str]:
-    """The robot's bodies that joints move."""
-    moved = {joint.body for joint in g1.JOINTS if joint.name in joints}
-    for body in g1.BODIES:  # parents come first
-        if body.parent in moved:
-            moved.add(body.name)
-    return moved
 
 
 def resample(motion: Motion, fps: float) -> Motion:

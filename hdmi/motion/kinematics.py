@@ -1,4 +1,4 @@
-"""Forward kinematics of the robot table, and derivatives of sampled motions."""
+"""Forward kinematics of a robot, and derivatives of sampled motions."""
 
 from __future__ import annotations
 
@@ -8,35 +8,33 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from hdmi.assets import g1
-from hdmi.assets.robot import RobotConfig, add_robot
+from hdmi.assets import Robot, RobotConfig, add_robot
 
 
-@lru_cache(maxsize=1)
-def robot_model() -> mujoco.MjModel:
-    """The robot alone: 7 + 29 positions, bodies in table order after the world."""
+@lru_cache(maxsize=4)
+def robot_model(robot: Robot) -> mujoco.MjModel:
+    """A robot alone: 7 + J positions, bodies in the record's order after the world."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
-    add_robot(spec, RobotConfig())
-    return spec.compile()
+    return add_robot(spec, RobotConfig(robot)).compile()
 
 
 def forward_kinematics(
-    root_pos: np.ndarray, root_quat: np.ndarray, joint_pos: np.ndarray
+    robot: Robot, root_pos: np.ndarray, root_quat: np.ndarray, joint_pos: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """World poses of all bodies.
 
     Args:
         root_pos: m. [T, 3]
         root_quat: wxyz. [T, 4]
-        joint_pos: in table order, rad. [T, 29]
+        joint_pos: in the robot's order, rad. [T, J]
 
     Returns:
-        Positions [T, B, 3] and orientations [T, B, 4], bodies in table order.
+        Positions [T, B, 3] and orientations [T, B, 4], bodies in the robot's order.
     """
-    model = robot_model()
+    model = robot_model(robot)
     data = mujoco.MjData(model)
-    num_frames, num_bodies = len(root_pos), len(g1.BODY_NAMES)
+    num_frames, num_bodies = len(root_pos), len(robot.body_names)
     pos, quat = np.empty((num_frames, num_bodies, 3)), np.empty((num_frames, num_bodies, 4))
     for t in range(num_frames):
         data.qpos[:3], data.qpos[3:7], data.qpos[7:] = root_pos[t], root_quat[t], joint_pos[t]

@@ -1,4 +1,4 @@
-"""The reference that training tracks: a motion in the order of the robot table, at the control rate, as tensors."""
+"""The reference that training tracks: a motion in the robot's order, at the control rate, as tensors."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig, g1
+from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig
 from hdmi.assets.surface import object_surfaces
 from hdmi.motion.complete import complete_robot, resample, without_fingers
 from hdmi.motion.format import Motion, MotionError, load_motion
-from hdmi.motion.kinematics import (
-    derivative,
-)
+from hdmi.motion.kinematics import derivative
 
 _ROOT_JOINT = "root"  # a column that some tools write for the free joint; nothing reads it
 _EMBEDDED = Path(__file__).parent / "references"
@@ -37,8 +35,8 @@ class Reference:
     """
 
     name: str
-    joint_pos: Tensor  # [T, 29] rad
-    joint_vel: Tensor  # [T, 29]
+    joint_pos: Tensor  # [T, J] rad
+    joint_vel: Tensor  # [T, J]
     body_pos: Tensor  # [T, B, 3]
     body_quat: Tensor  # [T, B, 4]
     body_lin_vel: Tensor  # [T, B, 3] of the bodies' origins
@@ -95,7 +93,7 @@ def make_reference(
     effectors: Sequence[Effector] = (),
     robot: RobotConfig | None = None,
 ) -> Reference:
-    """Completes a motion to a reference: table order, control rate, all joints and bodies.
+    """Completes a motion to a reference: the robot's order, control rate, all joints and bodies.
 
     Joints that the motion lacks hold the robot's default pose, and so do those that the robot holds there whatever a
     motion says; those of hands, which the robot lacks, are dropped with a warning. Bodies that the motion lacks, or
@@ -104,20 +102,23 @@ def make_reference(
     files often of their centres of mass.
 
     Raises:
-        MotionError: if the motion has joints or bodies that nothing knows, lacks the pelvis, the object, its
+        MotionError: if the motion has joints or bodies that nothing knows, lacks the robot's root, the object, its
             hinge, or contact labels for the effectors.
     """
     motion = motion if isinstance(motion, Motion) else load_motion(motion)
     where = f"motion {motion.name!r}"
     hinge = object.hinge.name if object is not None and object.hinge is not None else None
-    motion = without_fingers(motion, keep=hinge)
-    unknown = [name for name in motion.joint_names if name not in (*g1.JOINT_NAMES, _ROOT_JOINT, hinge)]
+    robot = robot or RobotConfig()
+    model = robot.model
+    known = (*model.joint_names, hinge)
+    motion = without_fingers(motion, keep=known)
+    unknown = [name for name in motion.joint_names if name not in (*known, _ROOT_JOINT)]
     if unknown:
         raise MotionError(f"{where}: joint_names: {unknown} are neither the robot's nor the object's hinge ({hinge!r})")
     motion = replace(motion, body_lin_vel_w=derivative(motion.body_pos_w, motion.fps))
     motion = complete_robot(resample(motion, 1.0 / control_dt), robot)
     num_frames = motion.num_frames
-    num_joints, num_bodies = len(g1.JOINT_NAMES), len(g1.BODY_NAMES)
+    num_joints, num_bodies = len(model.joint_names), len(model.body_names)
 
     empty = np.zeros((num_frames, 0))
     object_state = [empty] * 4

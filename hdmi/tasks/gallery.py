@@ -28,13 +28,16 @@ def picture_frame(task: Task) -> int:
 def _clearest_azimuth(renderer: WorldRenderer, moment: Moment, task: Task) -> float:
     """Of twelve directions around the robot the one in which the least of what matters is hidden."""
     model, data = moment.model, moment.data
-    robot, effectors = model.body("pelvis").id, [model.body(effector.body).id for effector in task.scene.effectors]
+    robot, effectors = (
+        model.body(task.scene.robot.root).id,
+        [model.body(effector.body).id for effector in task.scene.effectors],
+    )
     parts = [
         np.flatnonzero(model.body_rootid[model.geom_bodyid] == robot),
         task.scene.object_geoms,
         np.flatnonzero(np.isin(model.geom_bodyid, effectors)),
     ]
-    forward = data.body("pelvis").xmat.reshape(3, 3)[:2, 0]
+    forward = data.body(task.scene.robot.root).xmat.reshape(3, 3)[:2, 0]
     heading = math.degrees(math.atan2(forward[1], forward[0]))
 
     def clarity(azimuth: float) -> float:
@@ -57,7 +60,7 @@ def render_reference(task: Task, path: str | Path, size: tuple[int, int] = (360,
         raise ConfigError(f"{path}: expected a .jpg or .png file")
     frame = picture_frame(task)
     moment: Moment = next(replay(task, frame))
-    renderer = WorldRenderer(moment.model, *size, distance=_DISTANCE)
+    renderer = WorldRenderer(moment.model, task.scene.robot, *size, distance=_DISTANCE)
     try:
         renderer.turn(_clearest_azimuth(renderer, moment, task))
         image = picture(renderer, moment, Overlay(task, ghost=False), size)

@@ -23,9 +23,9 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hdmi.assets import RobotConfig, default_joint_pos, g1
+from hdmi.assets import RobotConfig, add_robot, default_joint_pos, g1
 from hdmi.assets.objects import add_geoms
-from hdmi.assets.robot import WORLD_BIT, add_robot
+from hdmi.assets.robot import WORLD_BIT
 
 PLANTED_WEIGHT = (300.0, 100.0)  # per m and per rad: a hundred times what hands and pelvis usually get
 _REACH = 0.04  # distance from which on a contact limits the motion, m
@@ -349,7 +349,7 @@ def _bare_model(self_collisions: bool, floor: float | None) -> mujoco.MjModel:
 def _spec(self_collisions: bool, floor: float | None) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
-    add_robot(spec, RobotConfig(self_collisions=self_collisions))
+    spec = add_robot(spec, RobotConfig(self_collisions=self_collisions))
     if floor is not None:
         spec.worldbody.add_geom(
             name="floor",

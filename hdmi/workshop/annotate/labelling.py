@@ -45,7 +45,7 @@ def annotate_motion(
     if unknown := (set(overrides.contacts) | set(overrides.points)) - set(names):
         raise MotionError(f"annotation: {sorted(unknown)} are no effectors of the task; those are {names}")
     if overrides.object or overrides.hinge:
-        motion = complete_object(motion, object=object, effectors=effectors, overrides=overrides)
+        motion = complete_object(motion, object=object, effectors=effectors, overrides=overrides, robot=robot)
     if object.name not in motion.body_names:
         raise MotionError(f"motion {motion.name!r}: lacks the task's object {object.name!r}: {_GIVE_POSE}")
     playback = make_playback(
@@ -67,7 +67,12 @@ def annotate_motion(
 
 
 def complete_object(
-    motion: Motion, *, object: ObjectConfig, effectors: Sequence[Effector], overrides: Overrides
+    motion: Motion,
+    *,
+    object: ObjectConfig,
+    effectors: Sequence[Effector],
+    overrides: Overrides,
+    robot: RobotConfig | None = None,
 ) -> Motion:
     """The motion with the object's trajectory, and its hinge's if it has one, made from keyframes.
 
@@ -84,8 +89,8 @@ def complete_object(
         contact = np.zeros((motion.num_frames, len(names)), bool)  # nothing that touches it moves it
     else:
         contact = _given_labels(motion, names, overrides)
-    robot = complete_robot(motion)
-    hands = [_body(robot, name) for name in names]
+    full = complete_robot(motion, None if robot is None else RobotConfig(robot.model))
+    hands = [_body(full, name) for name in names]
     hand_pos = np.stack(
         [pos + _rotate(quat, np.asarray(e.point, float)) for (pos, quat), e in zip(hands, effectors, strict=True)], 1
     )

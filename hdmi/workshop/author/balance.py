@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import solve_banded
 from scipy.signal import savgol_filter
 
-from hdmi.assets import g1
+from hdmi.assets import g1, g1_robot
 from hdmi.motion.kinematics import robot_model, smoothing_window
 
 GRAVITY = 9.81
@@ -63,7 +63,7 @@ def centre_of_pressure(qpos: np.ndarray, load: Load, ground: np.ndarray, fps: fl
     Returns:
         [T, 2] m
     """
-    model = robot_model()
+    model = robot_model(g1_robot())
     data = mujoco.MjData(model)
     com, spin = np.empty((len(qpos), 3)), np.empty((len(qpos), 3))
     for t in range(len(qpos)):

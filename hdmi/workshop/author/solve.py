@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig, g1, per_joint
+from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig, g1, g1_robot, per_joint
 from hdmi.assets.objects import add_object
 from hdmi.motion.format import Motion, motion_from_poses
 from hdmi.motion.kinematics import derivative, forward_kinematics, minimum_jerk
@@ -88,11 +88,14 @@ def author_motion(
         on_frame: called with the index of every frame of the last pass once it is solved, and their number.
 
     Raises:
-        PlanError: where the plan and the task do not fit together, or the plan is out of the robot's reach.
+        PlanError: where the plan and the task do not fit together, the plan is out of the robot's reach, or the robot
+            is another one than the G1.
         ImportError: without the extra `retarget`.
     """
     time = np.arange(round(plan.duration * FPS)) / FPS
     robot = robot or RobotConfig()
+    if robot.model != g1_robot():
+        raise PlanError(f"{plan.file}: plans are solved for the G1, and robot.model is {robot.model.name}")
     paths = _lay_out(plan, time, object, scenery, effectors)
     body = [*_foot_targets(paths), *_body_targets(plan, paths, robot)]
     hands, contact = _hand_targets(plan, paths, time, effectors, body, robot)
@@ -253,9 +256,9 @@ def _foot_targets(paths: _Paths) -> list[ik.Target]:
 def _body_targets(plan: Plan, paths: _Paths, robot: RobotConfig) -> list[ik.Target]:
     height = paths.root.pos[:, 2] + paths.pelvis_height
     pelvis_pos = np.column_stack([paths.root.pos[:, :2], height])
-    posture = per_joint(plan.posture, default=robot.default_joint_pos, where=f"{plan.file}: posture")
+    posture = per_joint(plan.posture, g1.JOINT_NAMES, default=robot.default_joint_pos, where=f"{plan.file}: posture")
     arms = {".*_(shoulder_.*|elbow|wrist_.*)_joint": plan.arm_posture}
-    weight = per_joint(arms | dict.fromkeys(robot.held_joints, HELD_WEIGHT), default=LEG_POSTURE_WEIGHT)
+    weight = per_joint(arms | dict.fromkeys(robot.held_joints, HELD_WEIGHT), g1.JOINT_NAMES, default=LEG_POSTURE_WEIGHT)
     return [
         ik.PointTarget("pelvis", pelvis_pos, (0.0, 0.0, PELVIS_WEIGHT[0])),
         ik.OrientationTarget("pelvis", paths.pelvis.as_quat(scalar_first=True), PELVIS_WEIGHT[1]),
@@ -303,7 +306,7 @@ def _rest_pose(paths: _Paths, body: Sequence[ik.Target]) -> dict[str, tuple[np.n
     targets = [_every(target, len(paths.pressure), len(paths.pressure)) for target in body]
     options = ik.IkOptions(limit_margin=LIMIT_MARGIN, self_collision=None)
     stance = ik.solve([*targets, ik.ComTarget([*com, 0.0], _over_feet())], 1, FPS, initial=start, options=options)
-    pos, quat = forward_kinematics(stance.root_pos, stance.root_quat, stance.joint_pos)
+    pos, quat = forward_kinematics(g1_robot(), stance.root_pos, stance.root_quat, stance.joint_pos)
     rows = {side: g1.BODY_NAMES.index(name) for side, name in HANDS.items()}
     return {side: (pos[0, b], Rotation.from_quat(quat[0, b], scalar_first=True)) for side, b in rows.items()}
 

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from hdmi.assets import g1
+from hdmi.assets import g1, g1_robot
 from hdmi.motion.check import MotionError
 from hdmi.motion.kinematics import forward_kinematics
 from hdmi.workshop.human import SMPL_JOINTS, HumanMotion
@@ -59,7 +59,9 @@ class Robot:
 @lru_cache(maxsize=1)
 def robot_measures() -> Robot:
     """The robot's measures from its table."""
-    pos, _ = forward_kinematics(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]), np.zeros((1, len(g1.JOINTS))))
+    pos, _ = forward_kinematics(
+        g1_robot(), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]), np.zeros((1, len(g1.JOINTS)))
+    )
     at = {name: pos[0, g1.BODY_NAMES.index(f"left_{body}")] for name, body in ROBOT_JOINTS.items()}
     torso = pos[0, g1.BODY_NAMES.index("torso_link")]
     palm = pos[0, g1.BODY_NAMES.index("left_wrist_yaw_link")] + PALM

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdmi.assets import Effector, ObjectConfig, default_joint_pos, g1
+from hdmi.assets import Effector, ObjectConfig, default_joint_pos, g1, g1_robot
 from hdmi.assets.robot import per_joint
 from hdmi.motion.check import MotionError
 from hdmi.motion.files import reading
@@ -166,7 +166,7 @@ def _targets(
         ik.PointTarget("pelvis", points.pelvis, _PELVIS),
         ik.OrientationTarget("pelvis", body.pelvis.as_quat(scalar_first=True), _PELVIS_TURN),
         ik.OrientationTarget("torso_link", body.torso.as_quat(scalar_first=True), _TORSO_TURN),
-        ik.PostureTarget(default_joint_pos(), per_joint(_POSTURE)),
+        ik.PostureTarget(default_joint_pos(), per_joint(_POSTURE, g1.JOINT_NAMES)),
     ]
     for side in SIDES:
         foot, hand = f"{side}_ankle_roll_link", f"{side}_wrist_yaw_link"
@@ -196,7 +196,7 @@ def _motion(
     effectors: Sequence[Effector],
     result: ik.IkResult,
 ) -> Motion:
-    pos, quat = forward_kinematics(result.root_pos, result.root_quat, result.joint_pos)
+    pos, quat = forward_kinematics(g1_robot(), result.root_pos, result.root_quat, result.joint_pos)
     joint_pos, body_names, joint_names = result.joint_pos, g1.BODY_NAMES, g1.JOINT_NAMES
     if scaled is not None:
         body_names = (*body_names, object.name if object is not None else scaled.name)

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdmi.assets import default_joint_pos, g1
+from hdmi.assets import default_joint_pos, g1, g1_robot
 from hdmi.motion.check import MotionError
 from hdmi.motion.format import Motion
 from hdmi.motion.kinematics import angular_velocity, forward_kinematics, robot_model
@@ -307,8 +307,8 @@ def _surface(motion: Motion, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray
         if name in g1.JOINT_NAMES:
             angles[:, g1.JOINT_NAMES.index(name)] = motion.joint_pos[frames, i]
     count = len(frames)
-    pos, quat = forward_kinematics(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), angles)
-    model = robot_model()
+    pos, quat = forward_kinematics(g1_robot(), np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), angles)
+    model = robot_model(g1_robot())
     points, radii = [], []
     for g in np.flatnonzero(model.geom_contype):
         body = model.geom_bodyid[g] - 1

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from hdmi.assets import g1
 from hdmi.motion.check import MotionError
 from hdmi.motion.complete import resample, without_fingers
 from hdmi.motion.files import read_npz
@@ -152,7 +153,7 @@ def convert(
     for key in ("clip", "joints"):
         if getattr(options, key) is not None and key not in FORMATS[source_format].takes:
             raise MotionError(f"{source}: {source_format} takes no {key}")
-    motion = without_fingers(FORMATS[source_format].read(source, options))
+    motion = without_fingers(FORMATS[source_format].read(source, options), keep=g1.JOINT_NAMES)
     motion = motion if fps is None else resample(motion, fps)
     path, lost = write(motion, out, options)
     return motion, path, lost

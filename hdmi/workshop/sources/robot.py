@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdmi.assets import default_joint_pos, g1
+from hdmi.assets import default_joint_pos, g1, g1_robot
 from hdmi.motion.check import MotionError, checked, checked_fps, checked_names, checked_quat
 from hdmi.motion.complete import complete_robot
 from hdmi.motion.files import read_npz, write_npz
@@ -97,7 +97,7 @@ def _kinematic_error(motion: Motion) -> float:
     """Mean distance between the bodies and their forward kinematics over a few frames, m."""
     frames = np.linspace(0, motion.num_frames - 1, 10).astype(int)
     pos, quat = motion.body_pos_w[frames], motion.body_quat_w[frames]
-    expected, _ = forward_kinematics(pos[:, 0], quat[:, 0], motion.joint_pos[frames])
+    expected, _ = forward_kinematics(g1_robot(), pos[:, 0], quat[:, 0], motion.joint_pos[frames])
     error = np.linalg.norm(pos - expected, axis=-1).mean()
     return float(error) if np.isfinite(error) else np.inf
 
@@ -250,7 +250,7 @@ def robot_motion(
     joint_names, joint_pos = tuple(joint_names[i] for i in kept), joint_pos[:, kept]
     table = np.tile(default_joint_pos(), (len(pos), 1))
     table[:, [g1.JOINT_NAMES.index(joint) for joint in joint_names]] = joint_pos
-    body_pos, body_quat = forward_kinematics(pos, quat, table)
+    body_pos, body_quat = forward_kinematics(g1_robot(), pos, quat, table)
     body_pos[:, 0], body_quat[:, 0] = pos, quat
     checked(where, fields[0], body_pos, body_pos.shape)
     motion = motion_from_poses(name, fps, g1.BODY_NAMES, joint_names, body_pos, body_quat, joint_pos)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdmi.assets import default_joint_pos, g1
+from hdmi.assets import default_joint_pos, g1, g1_robot
 from hdmi.motion.check import MotionError, checked, checked_fps, checked_names
 from hdmi.motion.complete import is_finger_joint
 from hdmi.motion.format import Motion
@@ -226,7 +226,7 @@ def _by_bodies(where: str, content: dict[str, Any], angles: np.ndarray) -> str |
         for i, joint in enumerate(joints):
             if joint in g1.JOINT_NAMES:
                 table[:, g1.JOINT_NAMES.index(joint)] = angles[frames, i]
-        pos, _ = forward_kinematics(origin, upright, table)
+        pos, _ = forward_kinematics(g1_robot(), origin, upright, table)
         apart = np.linalg.norm(pos[:, ours] - local[frames][:, theirs], axis=-1)
         errors[layout] = float(np.nan_to_num(apart, nan=np.inf).mean())
     best = min(errors, key=lambda layout: errors[layout], default=None)

@@ -13,7 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
-from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig
+from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig, g1_robot
+from hdmi.config import ConfigError
 from hdmi.motion.format import Motion, MotionError
 from hdmi.motion.playback import make_playback
 from hdmi.workshop.validate import checks
@@ -53,15 +54,18 @@ def validate_motion(
     shapes, number of label columns) is bad for that reason alone.
 
     Args:
-        robot: which G1; its feet are taken as four points each whatever they are, and joints that it holds where the
-            motion has them.
+        robot: how the G1 is built; its feet are taken as four points each whatever they are, and joints that it holds
+            where the motion has them.
         limits: instead of `LIMITS`.
         tolerance: how far from its contact point an effector may be at no cost in the task's interaction reward, m.
         reduce: the task's, too; `max`: of several effectors that are to touch, the nearest one counts.
 
     Raises:
+        ConfigError: for another robot than the G1, whose limits are held against it.
         ValueError: if the scene itself cannot be built, which says nothing about the motion.
     """
+    if robot is not None and robot.model != g1_robot():
+        raise ConfigError(f"robot.model: motions are validated against the limits of the G1, not of {robot.model.name}")
     # one geom per point of a foot tells a foot that rolls over its toes from one that slides
     robot = replace(robot or RobotConfig(), feet="sphere", held=())
     try:

@@ -28,7 +28,7 @@ def consistency(playback: Playback) -> dict[str, Series]:
     robot = [name for name in motion.body_names if name in g1.BODY_NAMES]
     rows, columns = [g1.BODY_NAMES.index(n) for n in robot], [motion.body_names.index(n) for n in robot]
     qpos = playback.qpos
-    pos, quat = forward_kinematics(qpos[:, :3], qpos[:, 3:7], qpos[:, playback.scene.joint_qpos])
+    pos, quat = forward_kinematics(playback.scene.robot, qpos[:, :3], qpos[:, 3:7], qpos[:, playback.scene.joint_qpos])
     along = np.abs((quat[:, rows] * motion.body_quat_w[:, columns]).sum(-1))
     absent = sum(name not in motion.joint_names for name in g1.JOINT_NAMES)
     return {
