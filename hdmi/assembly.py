@@ -27,6 +27,7 @@ from hdmi.assets import (
 )
 from hdmi.config import ConfigError, build, build_dataclass, one_line, plain_container, task_node
 from hdmi.envs import HumanoidObjectEnv, MaskedResetEnv, PhysicsBackend, ResetEnv, RowResetEnv
+from hdmi.envs.resets import check_row_resets
 from hdmi.motion import Reference, find_motion, make_reference
 from hdmi.motion.starts import StartTables, start_tables
 from hdmi.order import check_order, check_reads
@@ -192,6 +193,11 @@ def make_env(
     here = replace(task, reference=task.reference.to(base.device))
     transforms = make_transforms(cfg, here)
     check_reads(transforms, base)
+    for node, transform in transforms:
+        try:
+            check_row_resets(transform)
+        except TypeError as error:
+            raise ConfigError(f"{node}: {error}") from error
     stack = Compose(*(transform for _, transform in transforms)).to(base.device)
     settings = {"envs_per_thread": cfg.get("envs_per_thread"), **cfg.get("starts", {})}
     env = (MaskedResetEnv if base.backend.masked else RowResetEnv)(base, stack, **settings)

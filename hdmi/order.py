@@ -152,7 +152,7 @@ RULES: tuple[Rule, ...] = (
     Before(
         _drawn_per("episode"),
         _drawn_per("world"),
-        "resets go through the stack from last to first, and what is drawn once per world has to find an untouched model",
+        "resets go through the stack from last to first, and what is drawn per world has to find an untouched model",
         _same_field,
     ),
     _failures_have_a_frame,

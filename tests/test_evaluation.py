@@ -17,6 +17,7 @@ from tensordict import TensorDict
 
 from hdmi.assembly import make_env
 from hdmi.config import ConfigError
+from hdmi.envs.rendering import RenderingError
 from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy, protocol, render_checkpoint, video
 from hdmi.evaluation.agents import BlindAgent, blind_agent
 from hdmi.evaluation.protocol import FirstEpisodes, StartAtFrame, evaluation_config, termination_names
@@ -290,7 +291,7 @@ def gl() -> None:
     """Skips where nothing can be rendered."""
     try:
         video._renderer(lift_box().scene.model, (64, 64)).close()
-    except video.RenderingError as error:
+    except RenderingError as error:
         pytest.skip(str(error))
 
 
@@ -307,7 +308,7 @@ def test_pictures_beyond_the_usual_sizes(size: tuple[int, int]):
 
 @pytest.mark.parametrize("size", [(0, 64), (64, -1), (64, 100_000)])
 def test_pictures_of_impossible_sizes(size: tuple[int, int]):
-    with pytest.raises(video.RenderingError, match=f"pictures of {size[1]} x {size[0]} pixels: expected 1 to 8192"):
+    with pytest.raises(RenderingError, match=f"pictures of {size[1]} x {size[0]} pixels: expected 1 to 8192"):
         video._renderer(lift_box().scene.model, size)
 
 

@@ -15,8 +15,8 @@ from hdmi.envs.stepping import SteppedEnv
 from hdmi.motion.starts import FRAME_KEY, NOISE_SHARE_KEY
 from hdmi.threads import torch_threads
 
-# TorchRL's transforms that are about all environments in every reset: they keep something of each in themselves, or make
-# entries of all. Name -> what does the same here.
+# TorchRL's transforms that are about all environments in every reset: they keep something of each in themselves, or
+# make entries of all. Name -> what does the same here.
 _OF_ALL_ENVIRONMENTS = {
     "ActionMask": "a policy that reads the mask",
     "CatFrames": "hdmi.transforms.History",

@@ -19,7 +19,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
 from hdmi.assembly import Task, make_task
-from hdmi.envs.rendering import WorldRenderer, look_at
+from hdmi.envs.rendering import RenderingError, WorldRenderer, look_at
 from hdmi.evaluation.protocol import (
     Policy,
     evaluation_config,
@@ -43,10 +43,6 @@ _FORCE_SCALE = 0.015  # m/N
 _MAX_ARROW = 0.6  # m
 _MIN_FORCE = 1.0  # N; less is not drawn
 _FRAME_WIDTH = 6  # pixels of the red frame after a failure
-
-
-class RenderingError(RuntimeError):
-    """Nothing can be drawn here; the message says what to install or set."""
 
 
 @dataclass(frozen=True)
@@ -221,7 +217,7 @@ def write_video(
         for moment in moments:
             if renderer is None:
                 # the model of the world, not of the scene: objects are randomized in size
-                renderer = _renderer(moment.model, size)
+                renderer = WorldRenderer(moment.model, *size)
                 writer = imageio.get_writer(partial, fps=fps, codec="libx264", quality=8, macro_block_size=16)
             assert writer is not None
             writer.append_data(picture(renderer, moment, overlay, size))
@@ -236,13 +232,6 @@ def write_video(
             renderer.close()
         partial.unlink(missing_ok=True)
     return path
-
-
-def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> WorldRenderer:
-    try:
-        return WorldRenderer(model, *size)
-    except RuntimeError as error:
-        raise RenderingError(str(error)) from error
 
 
 def picture(renderer: WorldRenderer, moment: Moment, overlay: Overlay, size: tuple[int, int] = SIZE) -> np.ndarray:
