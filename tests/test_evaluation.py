@@ -17,7 +17,7 @@ from tensordict import TensorDict
 
 from hdmi.assembly import make_env
 from hdmi.config import ConfigError
-from hdmi.envs.rendering import RenderingError
+from hdmi.envs.rendering import RenderingError, WorldRenderer
 from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy, protocol, render_checkpoint, video
 from hdmi.evaluation.agents import BlindAgent, blind_agent
 from hdmi.evaluation.protocol import FirstEpisodes, StartAtFrame, evaluation_config, termination_names
@@ -290,7 +290,7 @@ def test_a_checkpoint_of_another_task_is_refused(run: Path):
 def gl() -> None:
     """Skips where nothing can be rendered."""
     try:
-        video._renderer(lift_box().scene.model, (64, 64)).close()
+        WorldRenderer(lift_box().scene.model, 64, 64).close()
     except RenderingError as error:
         pytest.skip(str(error))
 
@@ -301,7 +301,7 @@ def test_pictures_beyond_the_usual_sizes(size: tuple[int, int]):
     model = lift_box().scene.model
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    renderer = video._renderer(model, (32, 32))
+    renderer = WorldRenderer(model, 32, 32)
     assert renderer(model, data, *size).shape == (*size, 3)
     renderer.close()
 
@@ -309,7 +309,7 @@ def test_pictures_beyond_the_usual_sizes(size: tuple[int, int]):
 @pytest.mark.parametrize("size", [(0, 64), (64, -1), (64, 100_000)])
 def test_pictures_of_impossible_sizes(size: tuple[int, int]):
     with pytest.raises(RenderingError, match=f"pictures of {size[1]} x {size[0]} pixels: expected 1 to 8192"):
-        video._renderer(lift_box().scene.model, size)
+        WorldRenderer(lift_box().scene.model, *size)
 
 
 def short(moments: Iterator[video.Moment], count: int = 4) -> Iterator[video.Moment]:

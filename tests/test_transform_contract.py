@@ -80,6 +80,9 @@ CASES: dict[str, Case] = {
     "CenterOfMassRandomization": Case(
         lazy("CenterOfMassRandomization", bodies=["pelvis"], shift=0.1), "init", random=True
     ),
+    "Concatenate": Case(
+        lambda: T.Concatenate(["first", "second"], "out", {"first": [X], "second": [Y]}), "function", (X, Y)
+    ),
     "ContactMade": Case(T.ContactMade, "function", CONTACT[2:]),
     "ContactPoints": Case(
         lambda: T.ContactPoints(EFFECTORS),
