@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
-from torchrl.envs import CatTensors, Compose, RemoveEmptySpecs, SelectTransform, Transform
+from tensordict import NestedKey
+from torchrl.envs import Compose, RemoveEmptySpecs, SelectTransform, Transform
 
 from hdmi.assets import (
     Effector,
@@ -25,9 +26,11 @@ from hdmi.assets import (
     parse_geom,
 )
 from hdmi.config import ConfigError, build, build_dataclass, one_line, plain_container, task_node
-from hdmi.envs import HumanoidObjectEnv, MaskedResetEnv, PhysicsBackend, RowResetEnv
+from hdmi.envs import HumanoidObjectEnv, MaskedResetEnv, PhysicsBackend, ResetEnv, RowResetEnv
+from hdmi.envs.resets import check_row_resets
 from hdmi.motion import Reference, find_motion, make_reference
 from hdmi.motion.starts import StartTables, start_tables
+from hdmi.order import check_order, check_reads
 from hdmi.transforms import KernelReward, KernelTermination
 
 # What leaves the stack besides the state that steps read back.
@@ -43,6 +46,7 @@ OUTPUTS = (
     "step_count",
     "pixels",
 )
+_ABSENT = object()
 
 
 @dataclass(frozen=True)
@@ -188,19 +192,30 @@ def make_env(
     task: Task | None = None,
     pixels: tuple[int, int] | None = None,
     backend: Callable[[mujoco.MjModel, int], PhysicsBackend] | None = None,
-) -> RowResetEnv:
+) -> ResetEnv:
     """The environment of a config: the base environment under the transforms that `cfg.stack` lists.
 
     Args:
         num_envs: instead of the config's.
         task: made from the config if absent.
         backend: instead of the config's.
+
+    Raises:
+        ConfigError: for a node that cannot be built, or that does not stand where it has to (see `hdmi.order`).
     """
     task = make_task(cfg) if task is None else task
     base = HumanoidObjectEnv(task.scene, num_envs or cfg.num_envs, backend or backend_of(cfg), pixels)
     here = replace(task, reference=task.reference.to(base.device))
-    stack = Compose(*(transform for _, transform in make_transforms(cfg, here))).to(base.device)
-    env = (MaskedResetEnv if base.backend.masked else RowResetEnv)(base, stack, **cfg.get("starts", {}))
+    transforms = make_transforms(cfg, here)
+    check_reads(transforms, base)
+    for node, transform in transforms:
+        try:
+            check_row_resets(transform)
+        except TypeError as error:
+            raise ConfigError(f"{node}: {error}") from error
+    stack = Compose(*(transform for _, transform in transforms)).to(base.device)
+    settings = {"envs_per_thread": cfg.get("envs_per_thread"), **cfg.get("starts", {})}
+    env = (MaskedResetEnv if base.backend.masked else RowResetEnv)(base, stack, **settings)
     # raw keys are dropped, but for what steps read back and what learners and logs want
     state = set(env.full_state_spec.keys(True, True))
     entries = list(env.full_observation_spec.keys(True, True))
@@ -214,7 +229,11 @@ def _top(key: Any) -> str:
 
 
 def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
-    """The transforms of a config with the names of their nodes, from the base environment outwards."""
+    """The transforms of a config with the names of their nodes, from the base environment outwards.
+
+    Raises:
+        ConfigError: for a node that cannot be built, or that does not stand where it has to (see `hdmi.order`).
+    """
     robot = task.scene.robot
     context = {
         "joint_names": robot.joint_names,
@@ -234,40 +253,29 @@ def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
         "decimation": task.scene.sim.decimation,
     }
     stack: list[tuple[str, Transform]] = []
-    for group in cfg.stack:
-        if group not in cfg:
-            raise ConfigError(f"stack: the config has no group {group!r}")
-        if group == "observation":
-            stack += _observations(cfg, context)
-            continue
-        for name, node in (cfg[group] or {}).items():
-            if node is not None:
-                where = f"{group}.{name}"
-                stack.append((where, build(node, where, name=name, **context)))
+    written: dict[str, list[NestedKey]] = {}  # entry of the stack -> keys
+    for entry in cfg.stack:
+        keys: list[NestedKey] = []
+        for where, node in _nodes(cfg, entry):
+            transform = build(node, where, name=where.rpartition(".")[2], written=written, **context)
+            stack.append((where, transform))
+            keys += transform.out_keys or []
+        written[entry] = keys
+    check_order(stack)
     return stack
 
 
-def _observations(cfg: DictConfig, context: Mapping[str, Any]) -> list[tuple[str, Transform]]:
-    def terms(group: str) -> list[str]:
-        return [str(name) for name, node in (cfg.observation[group] or {}).items() if node is not None]
-
-    stack: list[tuple[str, Transform]] = []
-    for group in ("policy", "privileged"):
-        for name in terms(group):
-            where = f"observation.{group}.{name}"
-            stack.append((where, build(cfg.observation[group][name], where, out_key=("obs", name), **context)))
-    policy = [("obs", name) for name in terms("policy")]
-    privileged = [("obs", name) for name in terms("privileged")]
-
-    def cat(keys: list[tuple[str, str]], out_key: str) -> CatTensors:
-        return CatTensors(in_keys=keys, out_key=out_key, dim=-1, del_keys=False, sort=False)
-
-    stack.append(("observation.critic", cat(policy + privileged, "critic")))
-    for name, node in (cfg.noise or {}).items():
+def _nodes(cfg: DictConfig, entry: str) -> Iterator[tuple[str, Any]]:
+    """The nodes of an entry of the stack, with their names: itself if it has a `_target_`, else those in it."""
+    found = OmegaConf.select(cfg, entry, default=_ABSENT)
+    if found is _ABSENT:
+        raise ConfigError(f"stack: the config has no node {entry!r}")
+    if found is not None and "_target_" in found:
+        yield entry, found
+        return
+    for name, node in (found or {}).items():
         if node is not None:
-            stack.append((f"noise.{name}", build(node, f"noise.{name}", **context)))
-    stack.append(("observation.policy", cat(policy, "policy")))
-    return stack
+            yield f"{entry}.{name}", node
 
 
 def _class_of(transform: Transform) -> str:

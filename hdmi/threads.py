@@ -7,18 +7,21 @@ from contextlib import contextmanager
 
 import torch
 
-_ENVS_PER_THREAD = 4096  # with 2048, a second thread saves 0.4 ms of a step and costs physics 8
-
 
 @contextmanager
-def torch_threads(num_envs: int) -> Iterator[None]:
+def torch_threads(num_envs: int, envs_per_thread: int | None) -> Iterator[None]:
     """Lowers torch's threads to what tensors of so many rows can use, without changing them for good.
 
     Torch's threads wait for work by spinning, for milliseconds, on processors that physics wants. While worlds are
     stepped, a policy between the steps should therefore have no more of them than the environment.
+
+    Args:
+        num_envs: rows.
+        envs_per_thread: rows that are worth a thread; None leaves torch's threads alone.
     """
     before = torch.get_num_threads()
-    torch.set_num_threads(min(before, -(-num_envs // _ENVS_PER_THREAD)))
+    if envs_per_thread is not None:
+        torch.set_num_threads(min(before, -(-num_envs // envs_per_thread)))
     try:
         yield
     finally:

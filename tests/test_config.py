@@ -19,7 +19,6 @@ from hdmi.assembly import describe, make_env, make_task, make_transforms
 from hdmi.config import ConfigError, build
 from hdmi.motion import MotionError
 
-CONCATENATIONS = ("observation.critic", "observation.policy")
 ABLATIONS = sorted(path.stem for path in (CONF / "ablation").glob("*.yaml"))
 
 PER_WORLD = ("robot_mass", "robot_com", "robot_friction", "object_scale")
@@ -58,8 +57,7 @@ def stack_of(*overrides: str) -> dict[str, str]:
     cfg = load_config(*overrides)
     out = {}
     for name, transform in make_transforms(cfg, lift_box()):
-        node = None if name in CONCATENATIONS else OmegaConf.select(cfg, name)
-        out[name] = f"{type(transform).__name__} {OmegaConf.to_container(node, resolve=True) if node else ''}"
+        out[name] = f"{type(transform).__name__} {OmegaConf.to_container(OmegaConf.select(cfg, name), resolve=True)}"
     return out
 
 
@@ -141,8 +139,13 @@ class TestMistakes:
             ("randomization.robot_mass.among=object", r"randomization\.robot_mass.*among"),
             ("termination.lost_contact.require=any", r"termination\.lost_contact.*'any'"),
             ("reference_set.joints=[tail_joint]", r"reference\.motion.*tail_joint"),
-            ("noise.gravity_history.steps=0", r"noise\.gravity_history.*steps"),
+            ("history.gravity.steps=0", r"history\.gravity.*steps"),
             ("stack=[reset,magic]", r"stack.*'magic'"),
+            ("stack=[observation]", r"observation\.policy: has no _target_"),
+            (
+                "stack=[observation.policy,input.critic]",
+                r"input\.critic.*\['observation.privileged'\] do not stand before",
+            ),
         ],
     )
     def test_in_the_stack(self, override, message):
@@ -193,7 +196,10 @@ class TestMistakes:
     def test_reads_of_what_the_stack_does_not_write(self):
         """Leaving out a part that others read is told with the reader and the key."""
         cfg = load_config("tracking.contact_points=null")
-        with pytest.raises((ConfigError, KeyError), match=r"contact.*target_pos"):
+        told = (
+            r"termination\.lost_contact \(LostContact\) reads \('contact', 'eef_pos'\), which nothing before it writes"
+        )
+        with pytest.raises(ConfigError, match=told):
             make_env(cfg, 2, lift_box())
 
     def test_build_wants_a_target(self):

@@ -8,13 +8,16 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from mocks import lift_box, load_config
+from mocks import ScriptedEnv, assert_same, lift_box, load_config, make_script
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.data import Unbounded
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs import transforms as tt
 
 from hdmi.assembly import make_env
-from hdmi.envs import BatchBackend, RowResetEnv
+from hdmi.config import ConfigError
+from hdmi.envs import BatchBackend, MaskedResetEnv, ResetEnv, RowResetEnv
 from hdmi.learning.collectors import WorldCollector
 
 DETERMINISTIC = ("+ablation=no_randomization", "reset.state.start=first", "~reset.state.noise")
@@ -143,8 +146,88 @@ class TestRowReset:
         torch.testing.assert_close(base.backend.data("qpos")[:, :3].float(), rows)
 
 
+class RowsEnv(ScriptedEnv):
+    """Four scripted worlds that reset alone."""
+
+    def __init__(self) -> None:
+        super().__init__(make_script([("error", "many")], n=4))
+
+    def reset_rows(self, tensordict: TensorDictBase) -> TensorDictBase:
+        worlds = tensordict["worlds"]
+        self.counter = self.counter.clone()
+        self.counter[worlds] = 0
+        return self._state()[worlds]
+
+
+def play(env: EnvBase, ends: list[list[int]]) -> list[TensorDictBase]:
+    """Steps, after each of which some worlds are done; what was stepped, and what came after the resets."""
+    tensordict, out = env.reset(), []
+    for done in ends:
+        stepped = env.step(tensordict.set("action", torch.zeros(4, 4)))
+        following = env.step_mdp(stepped)
+        for key in ("done", "terminated"):
+            following[key][done] = True
+        tensordict = env.maybe_reset(following)
+        out += [stepped["next"].clone(), tensordict.clone()]
+    return out
+
+
+class TestTorchRLTransforms:
+    @pytest.mark.parametrize("cls", [RowResetEnv, MaskedResetEnv])
+    @pytest.mark.parametrize(
+        "make",
+        [
+            tt.StepCounter,
+            tt.RewardSum,
+            tt.InitTracker,
+            lambda: tt.TargetReturn(3.0),
+            lambda: tt.RewardScaling(1.0, 2.0),
+            lambda: tt.FrameSkipTransform(2),
+            lambda: tt.ObservationNorm(loc=0.0, scale=2.0, in_keys=["clock"]),
+        ],
+        ids=lambda make: type(make()).__name__,
+    )
+    def test_that_are_taken_do_as_in_torchrl(self, cls: type[ResetEnv], make: Any):
+        ends = [[0, 1, 3], [2], [], [1]]
+        for ours, theirs in zip(
+            play(cls(RowsEnv(), make()), ends), play(TransformedEnv(RowsEnv(), make()), ends), strict=True
+        ):
+            assert_same(ours, theirs)
+
+    @pytest.mark.parametrize("cls", [RowResetEnv, MaskedResetEnv])
+    @pytest.mark.parametrize(
+        ("make", "told"),
+        [
+            (lambda: tt.CatFrames(N=3, dim=-1, in_keys=["clock"]), r"CatFrames: .*; use hdmi\.transforms\.History"),
+            (lambda: tt.TimeMaxPool(in_keys=["clock"], T=3), r"TimeMaxPool: .*History"),
+            (lambda: tt.RandomTruncationTransform(2, 5), r"RandomTruncationTransform: .*ReferenceStateInitialization"),
+            (lambda: tt.TensorDictPrimer(h=Unbounded(shape=(3,)), expand_specs=True), r"TensorDictPrimer: .*StateTr"),
+            (lambda: tt.gSDENoise(state_dim=2, action_dim=4), r"gSDENoise: .*StateTransform"),
+            (lambda: tt.ActionMask(), r"ActionMask: .*policy"),
+            (lambda: tt.VecNormV2(in_keys=["clock"]), r"VecNormV2: .*reduce_batch_dims=True, or .*RunningNorm"),
+        ],
+        ids=lambda value: type(value()).__name__ if callable(value) else "",
+    )
+    def test_that_a_reset_of_some_would_corrupt_are_refused(self, cls: type[ResetEnv], make: Any, told: str):
+        for nested in (make(), Compose(tt.StepCounter(), Compose(make()))):
+            with pytest.raises(TypeError, match=told):
+                cls(RowsEnv(), nested)
+        env = cls(RowsEnv(), Compose())
+        with pytest.raises(TypeError, match=told):
+            env.append_transform(make())
+        with pytest.raises(TypeError, match=told):
+            env.insert_transform(0, make())
+        cls(RowsEnv(), tt.VecNormV2(in_keys=["clock"], reduce_batch_dims=True))
+
+    def test_config_nodes_are_named(self):
+        node = "{_target_: torchrl.envs.CatFrames, N: 2, dim: -1, in_keys: [[robot, joint_pos]]}"
+        with pytest.raises(ConfigError, match=r"^tracking\.frames: CatFrames: .*use hdmi\.transforms\.History$"):
+            env_of(2, f"+tracking.frames={node}")
+
+
 def test_torch_threads_are_few_while_it_steps_and_as_before_afterwards(monkeypatch: pytest.MonkeyPatch):
-    env, seen = env_of(3), []
+    assert load_config().envs_per_thread == 4096
+    env, seen = env_of(3, "envs_per_thread=2"), []
     start = env.reset()
     backend = env.base_env.backend
     for name in ("step", "refresh"):
@@ -166,8 +249,10 @@ def test_torch_threads_are_few_while_it_steps_and_as_before_afterwards(monkeypat
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)
-    assert len(seen) >= 3  # rows of those that reset, their physics, everyone's
-    assert set(seen) == {1}
+    # rows of the one that resets and its physics; everyone's
+    assert len(seen) >= 3
+    assert seen == sorted(seen)
+    assert set(seen) == {1, 2}
 
 
 def test_a_policy_has_no_more_threads_than_the_environment_while_experience_is_collected():

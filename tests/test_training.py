@@ -207,9 +207,21 @@ class TestCheckpoint:
                 load_checkpoint(tmp_path)
             assert len(str(failed.value).splitlines()) == 1
             assert "weights_only" not in str(failed.value)
-        torch.save({"something": torch.zeros(1)}, path)
-        with pytest.raises(CheckpointError, match="format"):
+        for content in ({"something": torch.zeros(1)}, {"format": "other"}, [1]):
+            torch.save(content, path)
+            with pytest.raises(CheckpointError, match="not an hdmi checkpoint of format"):
+                load_checkpoint(path)
+
+    def test_of_an_older_version(self, tmp_path: Path) -> None:
+        """Says what its config has elsewhere, in one line."""
+        path = tmp_path / "policy.pt"
+        torch.save({"format": 3, "config": {"termination": {"motion_end": {}}}}, path)
+        told = (
+            r"policy\.pt: of format 3, made by an older version of hdmi.*motion_end and step_count are nodes of horizon"
+        )
+        with pytest.raises(CheckpointError, match=told) as failed:
             load_checkpoint(path)
+        assert len(str(failed.value).splitlines()) == 1
 
     def test_never_unpickles_code(self, tmp_path: Path) -> None:
         class Hostile:

@@ -120,6 +120,11 @@ CASES: dict[str, Case] = {
         lazy("CenterOfMassRandomization", bodies=["pelvis"], shift=0.1), "init", random=True
     ),
     "ContactMade": Case(lambda r, **k: T.ContactMade(**k), "function", CONTACT[2:]),
+    "Concatenate": Case(
+        lambda r, **k: T.Concatenate(["first", "second"], r("out"), {"first": [r(X)], "second": [r(Y)]}, **k),
+        "function",
+        (X, Y),
+    ),
     "ContactPoints": Case(
         lambda r, **k: T.ContactPoints(EFFECTORS, g1.BODY_NAMES, **k),
         "function",

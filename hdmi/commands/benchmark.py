@@ -120,7 +120,8 @@ def step_env(
     if raw is not None:
         raw.begin()
     for _ in range(count):
-        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM), torch_threads(env.base_env.num_envs):
+        threads = torch_threads(env.base_env.num_envs, env.envs_per_thread)
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM), threads:
             carry = policy(carry)
         start = now()
         _, carry = env.step_and_maybe_reset(carry)

@@ -15,7 +15,7 @@ from rich.console import Console
 from hdmi.commands.options import parse_options
 from hdmi.commands.script import run_script
 from hdmi.config import ConfigError
-from hdmi.evaluation import RenderingError
+from hdmi.envs.rendering import RenderingError
 from hdmi.evaluation.card import export
 
 

@@ -20,7 +20,7 @@ from hdmi.assembly import Task, make_task
 from hdmi.commands.options import parse_options
 from hdmi.commands.script import run_script
 from hdmi.config import ConfigError, task_config
-from hdmi.evaluation import RenderingError
+from hdmi.envs.rendering import RenderingError
 from hdmi.evaluation.agents import AGENTS, blind_agent
 from hdmi.evaluation.protocol import Policy, load_checked_policy, run_folder_of
 from hdmi.evaluation.video import Moment, Overlay, every, play_moments, replay, show, write_video

@@ -23,7 +23,8 @@ from hdmi.assembly import describe, make_transforms
 from hdmi.commands.script import USER_ERRORS
 from hdmi.config import CONF, ConfigError, use_installed_configs
 from hdmi.console import make_console
-from hdmi.evaluation import RenderingError, evaluate_checkpoint, render_checkpoint
+from hdmi.envs.rendering import RenderingError
+from hdmi.evaluation import evaluate_checkpoint, render_checkpoint
 from hdmi.evaluation.protocol import training_figures
 from hdmi.learning.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from hdmi.learning.logger import RunLogger

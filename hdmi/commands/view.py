@@ -19,7 +19,7 @@ from hdmi.assembly import Task
 from hdmi.commands.options import parse_motion_options
 from hdmi.commands.script import run_script
 from hdmi.config import ConfigError
-from hdmi.evaluation import RenderingError
+from hdmi.envs.rendering import RenderingError
 from hdmi.evaluation.video import Overlay, every, replay, write_video
 from hdmi.motion.playback import Playback
 from hdmi.workshop.view.browser import ReferenceViewer

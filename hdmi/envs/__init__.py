@@ -2,6 +2,6 @@
 
 from hdmi.envs.backend import BatchBackend, PhysicsBackend
 from hdmi.envs.humanoid import HumanoidObjectEnv
-from hdmi.envs.resets import MaskedResetEnv, RowResetEnv
+from hdmi.envs.resets import MaskedResetEnv, ResetEnv, RowResetEnv
 
-__all__ = ["BatchBackend", "HumanoidObjectEnv", "MaskedResetEnv", "PhysicsBackend", "RowResetEnv"]
+__all__ = ["BatchBackend", "HumanoidObjectEnv", "MaskedResetEnv", "PhysicsBackend", "ResetEnv", "RowResetEnv"]

@@ -391,7 +391,7 @@ class HumanoidObjectEnv(EnvBase):
         """A picture of one world from a camera that follows the robot. uint8 [height, width, 3]
 
         Raises:
-            RuntimeError: if no rendering back end works; says what to install.
+            RenderingError: if no rendering back end works; says what to install.
         """
         if self._renderer is None:
             self._renderer = WorldRenderer(self.scene.model, self.scene.robot, height, width)

@@ -21,6 +21,18 @@ _HELP = (
 _LARGEST = 8192  # pixels, either way: not every OpenGL implementation gives more
 
 
+class RenderingError(RuntimeError):
+    """Nothing can be drawn here; the message says what to install or set.
+
+    Examples:
+        >>> try:
+        ...     raise RenderingError("window=true needs a display")  # as `render_checkpoint` does without OpenGL
+        ... except RuntimeError as error:
+        ...     print(error)
+        window=true needs a display
+    """
+
+
 def _choose_gl() -> None:
     """Falls back to EGL where there is no display and the user has not chosen."""
     headless = sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -34,14 +46,14 @@ def _choose_gl() -> None:
 
 def _make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
     if not (1 <= height <= _LARGEST and 1 <= width <= _LARGEST):
-        raise RuntimeError(f"pictures of {width} x {height} pixels: expected 1 to {_LARGEST} each way")
+        raise RenderingError(f"pictures of {width} x {height} pixels: expected 1 to {_LARGEST} each way")
     buffer = model.vis.global_
     buffer.offwidth, buffer.offheight = max(width, buffer.offwidth), max(height, buffer.offheight)
     try:
         _choose_gl()
         return mujoco.Renderer(model, height, width)
     except Exception as error:
-        raise RuntimeError(_HELP.format(error=error)) from error
+        raise RenderingError(_HELP.format(error=error)) from error
 
 
 def look_at(data: mujoco.MjData, robot: Robot) -> np.ndarray:
@@ -54,7 +66,7 @@ class WorldRenderer:
     """Renders worlds of one model with a camera that follows the robot's root.
 
     Raises:
-        RuntimeError: if no rendering back end works; says what to install. For pictures of no size, or too large.
+        RenderingError: if no rendering back end works; says what to install. For pictures of no size, or too large.
     """
 
     def __init__(

@@ -1,53 +1,64 @@
-"""A transformed environment whose steps and resets cost what they must."""
+"""Transformed environments whose resets cost what they must."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, Transform
 
+from hdmi.envs.stepping import SteppedEnv
 from hdmi.names import FRAME_KEY, NOISE_SHARE_KEY
 from hdmi.threads import torch_threads
 
+# TorchRL's transforms that are about all environments in every reset: they keep something of each in themselves, or
+# make entries of all. Name -> what does the same here.
+_OF_ALL_ENVIRONMENTS = {
+    "ActionMask": "a policy that reads the mask",
+    "CatFrames": "hdmi.transforms.History",
+    "ConditionalPolicySwitch": "a policy that decides by itself",
+    "RandomTruncationTransform": "hdmi.transforms.ReferenceStateInitialization, which spreads starts over the motion",
+    "TensorDictPrimer": "a subclass of hdmi.transforms.common.StateTransform",
+    "TimeMaxPool": "hdmi.transforms.History",
+    "VecNormV2": "reduce_batch_dims=True, or hdmi.learning.RunningNorm in the networks",
+}
 
-class RowResetEnv(TransformedEnv):
-    """A `TransformedEnv` that resets only rows: the stack sees a batch of the n environments that are done.
 
-    TorchRL computes a reset for all N environments and keeps n of them; where few episodes end at a step, a deep stack
-    then costs twice. Here base environment and transforms are given the n rows, with their numbers
-    under `worlds` int64 [n], and results are written into copies of the others' tensors. `reset` itself is unchanged.
+class ResetEnv(SteppedEnv):
+    """Base of a `TransformedEnv` that draws starts again where they are too deep; see its two kinds.
 
     A start in which the object's deepest contact exceeds `max_penetration` is drawn again, up to `redraws` times: first
     from the same frame, each time with less of its noise and then with none, then from other frames without noise (see
     `ReferenceStateInitialization`). How many were is counted in `num_redrawn`, and how many stayed too deep all the
     same in `num_deep`.
 
-    While it steps, torch has one thread per 4096 environments; see `torch_threads`.
-
-    `compile_transforms` compiles the stack with `torch.compile`.
-
-    The base environment must have `reset_rows` (see `HumanoidObjectEnv`), and transforms must take the batch size
-    from the tensordict.
+    The base environment must have `penetration` if anything is to be drawn again (see `HumanoidObjectEnv`), and
+    transforms must take the batch size from the tensordict and keep nothing of single environments in themselves.
 
     Args:
-        env, transform: as for `TransformedEnv`.
+        env, transform, envs_per_thread: as for `SteppedEnv`.
         max_penetration: m.
         redraws: at most; with 0 every start is taken as it comes.
 
-    Examples:
-        >>> from torchrl.envs import Compose, StepCounter
-        >>> from hdmi.assets import RobotConfig, SimConfig, build_scene
-        >>> base = HumanoidObjectEnv(build_scene(RobotConfig(), SimConfig()), num_envs=2)
-        >>> env = RowResetEnv(base, Compose(StepCounter(max_steps=2)))
-        >>> env.rollout(4, break_when_any_done=False)["next", "step_count"][0].flatten().tolist()
-        [1, 2, 1, 2]
+    Raises:
+        TypeError: for a transform of TorchRL's that a reset of some environments would corrupt; says what to use.
     """
 
-    def __init__(self, env: EnvBase, transform: Transform, *, max_penetration: float = 0.02, redraws: int = 0):
-        super().__init__(env, transform)
+    def __init__(
+        self,
+        env: EnvBase,
+        transform: Transform,
+        *,
+        envs_per_thread: int | None = None,
+        max_penetration: float = 0.02,
+        redraws: int = 0,
+    ):
+        check_row_resets(transform)
+        super().__init__(env, transform, envs_per_thread=envs_per_thread)
         self.max_penetration, self.redraws = max_penetration, redraws
         self._counts = torch.zeros(2, dtype=torch.int64, device=env.device)
 
@@ -61,6 +72,14 @@ class RowResetEnv(TransformedEnv):
         """Starts so far whose last drawing, too, was too deep. Reading it waits for the device."""
         return int(self._counts[1])
 
+    def append_transform(self, transform: Any) -> Any:
+        check_row_resets(transform)
+        return super().append_transform(transform)
+
+    def insert_transform(self, index: int, transform: Transform) -> Any:
+        check_row_resets(transform)
+        return super().insert_transform(index, transform)
+
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         keys = [*self.reset_keys, *self.state_spec.keys(True, True)]
         tensordict = None if tensordict is None else tensordict.select(*keys, strict=False)
@@ -73,6 +92,7 @@ class RowResetEnv(TransformedEnv):
         self._redraw(start, fresh, mask.reshape(-1))
         return self.transform._reset(start, fresh)
 
+    @abstractmethod
     def _redraw(self, start: TensorDictBase, fresh: TensorDictBase, mask: Tensor) -> None:
         """Draws starts again where they are too deep, and writes them into `start` and `fresh`.
 
@@ -81,6 +101,40 @@ class RowResetEnv(TransformedEnv):
             fresh: the base environment's state after that; batch [N].
             mask: which worlds are meant, bool [N].
         """
+
+    def _too_deep(self, worlds: Tensor | slice = slice(None)) -> Tensor:
+        return self.base_env.penetration()[worlds] > self.max_penetration
+
+    def _again(self, start: TensorDictBase, attempt: int) -> TensorDictBase:
+        """A start to draw again: what came before, how much of the noise is left, and in the first half the frame."""
+        half = (self.redraws + 1) // 2
+        share, frame = max(0.0, 1 - attempt / half), start.get(FRAME_KEY, None)
+        again = start.exclude("init")
+        again.set(NOISE_SHARE_KEY, torch.full((*start.batch_size, 1), share, device=start.device))
+        if frame is not None and attempt <= half:
+            again.set(FRAME_KEY, frame)
+        return again
+
+
+class RowResetEnv(ResetEnv):
+    """Resets only rows: the stack sees a batch of the n environments that are done.
+
+    TorchRL computes a reset for all N environments and keeps n of them; where few episodes end at a step, a deep stack
+    then costs twice. Here base environment and transforms are given the n rows, with their numbers
+    under `worlds` int64 [n], and results are written into copies of the others' tensors. `reset` itself is unchanged.
+
+    The base environment must have `reset_rows` (see `HumanoidObjectEnv`).
+
+    Examples:
+        >>> from torchrl.envs import Compose, StepCounter
+        >>> from hdmi.assets import RobotConfig, SimConfig, build_scene
+        >>> base = HumanoidObjectEnv(build_scene(RobotConfig(), SimConfig()), num_envs=2)
+        >>> env = RowResetEnv(base, Compose(StepCounter(max_steps=2)))
+        >>> env.rollout(4, break_when_any_done=False)["next", "step_count"][0].flatten().tolist()
+        [1, 2, 1, 2]
+    """
+
+    def _redraw(self, start: TensorDictBase, fresh: TensorDictBase, mask: Tensor) -> None:
         self._redraw_rows(start, fresh, *[mask.nonzero().squeeze(-1)] * 2)
 
     def _redraw_rows(self, start: TensorDictBase, fresh: TensorDictBase, worlds: Tensor, at: Tensor) -> None:
@@ -98,38 +152,17 @@ class RowResetEnv(TransformedEnv):
         if self.redraws:
             self._counts[1] += self._too_deep(worlds).sum()
 
-    def _too_deep(self, worlds: Tensor | slice = slice(None)) -> Tensor:
-        return self.base_env.penetration()[worlds] > self.max_penetration
-
-    def _again(self, start: TensorDictBase, attempt: int) -> TensorDictBase:
-        """A start to draw again: what came before, how much of the noise is left, and in the first half the frame."""
-        half = (self.redraws + 1) // 2
-        share, frame = max(0.0, 1 - attempt / half), start.get(FRAME_KEY, None)
-        again = start.exclude("init")
-        again.set(NOISE_SHARE_KEY, torch.full((*start.batch_size, 1), share, device=start.device))
-        if frame is not None and attempt <= half:
-            again.set(FRAME_KEY, frame)
-        return again
-
     def compile_transforms(self, **options: Any) -> None:
-        """Compiles what the transforms do in a step and in a reset of rows; the stack must be complete.
-
-        The first step and the first reset then take about a minute each. Actions on their way in, a reset of all
-        environments and of a single one stay as they are.
+        """Compiles the transforms; see `SteppedEnv`. Resets of all environments and of a single one stay as they are.
 
         Args:
             options: of `torch.compile`.
         """
-        step = torch.compile(self.transform._step, dynamic=False, **options)
+        super().compile_transforms(**options)
         reset = torch.compile(self.transform._reset, dynamic=True, **options)
 
-        # under the same gradient mode whoever steps the environment: another one would be compiled again
         @torch.no_grad()
-        def compiled_step(tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-            return step(tensordict, next_tensordict)
-
-        @torch.no_grad()
-        def compiled_reset(tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        def compiled(tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
             # Only the number of rows varies. It must not be tied to sizes and offsets that happen to equal it: copies
             # have no offsets, and the other sizes are declared fixed.
             tensordict, tensordict_reset = tensordict.clone(), tensordict_reset.clone()
@@ -137,21 +170,17 @@ class RowResetEnv(TransformedEnv):
                 torch._dynamo.mark_static(value, list(range(1, value.ndim)))
             return reset(tensordict, tensordict_reset)
 
-        self.transform._step = compiled_step  # type: ignore[method-assign]
-        self._reset_transforms = compiled_reset  # type: ignore[method-assign]
+        self._reset_transforms = compiled  # type: ignore[method-assign]
 
     def _reset_transforms(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self.transform._reset(tensordict, tensordict_reset)
-
-    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        with torch_threads(self.base_env.batch_size.numel()):
-            return super().step(tensordict)
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         if not self.any_done(tensordict):
             return tensordict
         worlds = tensordict.get("_reset").reshape(-1).nonzero().squeeze(-1)
-        with torch_threads(len(worlds)):  # taking rows out of large tensors would wake the others already
+        # taking rows out of large tensors would wake the other threads already
+        with torch_threads(len(worlds), self.envs_per_thread):
             part = tensordict[worlds].set("worlds", worlds)
             tensordict = tensordict.exclude("_reset")
             part = self.transform._reset_env_preprocess(part)
@@ -166,8 +195,8 @@ class RowResetEnv(TransformedEnv):
         return tensordict
 
 
-class MaskedResetEnv(RowResetEnv):
-    """A `TransformedEnv` whose steps and resets never wait for the device.
+class MaskedResetEnv(ResetEnv):
+    """Resets without waiting for the device.
 
     How many environments are done is known on the device only. The stack therefore computes a reset of all of them in
     every step, in tensors of fixed size, and a mask says whose results count. On a CPU, where asking costs nothing,
@@ -182,16 +211,6 @@ class MaskedResetEnv(RowResetEnv):
         [1, 2, 1, 2]
     """
 
-    def compile_transforms(self, **options: Any) -> None:
-        """Compiles what the transforms do in a step and in a reset; the stack must be complete.
-
-        Args:
-            options: of `torch.compile`.
-        """
-        for name in ("_step", "_reset"):
-            compiled = torch.compile(getattr(self.transform, name), dynamic=False, **options)
-            setattr(self.transform, name, torch.no_grad()(compiled))
-
     def _redraw(self, start: TensorDictBase, fresh: TensorDictBase, mask: Tensor) -> None:
         for attempt in range(1, self.redraws + 1):
             deep = mask & self._too_deep()
@@ -203,6 +222,11 @@ class MaskedResetEnv(RowResetEnv):
                 start.set(FRAME_KEY, torch.where(deep.unsqueeze(-1), again.get(FRAME_KEY), frame))
         if self.redraws:
             self._counts[1] += (mask & self._too_deep()).sum()
+
+    def compile_transforms(self, **options: Any) -> None:
+        super().compile_transforms(**options)
+        reset = torch.compile(self.transform._reset, dynamic=False, **options)
+        self.transform._reset = torch.no_grad()(reset)  # type: ignore[method-assign]
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         done = tensordict.get("done")
@@ -217,3 +241,26 @@ class MaskedResetEnv(RowResetEnv):
             chosen = mask.reshape(-1, *[1] * (value.ndim - 1))
             tensordict.set(key, torch.where(chosen, value, tensordict.get(key)))
         return tensordict
+
+
+def check_row_resets(transform: Any) -> None:
+    """Checks that resets of some environments do not corrupt a transform, or those in it.
+
+    Raises:
+        TypeError: if they would; names it and what to use instead.
+    """
+    for part in _parts(transform):
+        names = [cls.__name__ for cls in type(part).__mro__ if cls.__module__.startswith("torchrl.")]
+        refused = [name for name in names if name in _OF_ALL_ENVIRONMENTS]
+        if refused and not getattr(part, "reduce_batch_dims", False):  # statistics over all are of none
+            raise TypeError(
+                f"{type(part).__name__}: is about all environments in every reset, and this environment resets some "
+                f"alone; use {_OF_ALL_ENVIRONMENTS[refused[0]]}"
+            )
+
+
+def _parts(transform: Any) -> Iterator[Any]:
+    yield transform
+    if isinstance(transform, Compose):
+        for part in transform.transforms:
+            yield from _parts(part)

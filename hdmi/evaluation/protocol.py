@@ -53,7 +53,6 @@ UNITS = {
 }
 HORIZON = "_horizon"  # of errors over the whole motion, survived or not
 _MADE, _INTENDED = "contact_made", "contact_intended"
-_NOT_TERMINATIONS = ("motion_end", "step_count")  # in the group, but no failures
 _DIVERGED, _OTHER = "diverged", "other"
 
 
@@ -96,8 +95,7 @@ def evaluation_config(
 
 def termination_names(cfg: DictConfig) -> list[str]:
     """Nodes of a config that end episodes as failures."""
-    nodes = cfg.termination or {}
-    return [str(name) for name, node in nodes.items() if node is not None and name not in _NOT_TERMINATIONS]
+    return [str(name) for name, node in (cfg.termination or {}).items() if node is not None]
 
 
 def _terminations_of_task(cfg: DictConfig) -> list[str]:
@@ -107,11 +105,11 @@ def _terminations_of_task(cfg: DictConfig) -> list[str]:
 
 def make_evaluation_env(cfg: DictConfig, task: Task, num_envs: int) -> TransformedEnv:
     """The environment of an `evaluation_config`; no step limit below the motion's length."""
-    step_count = (cfg.termination or {}).get("step_count")
+    step_count = (cfg.horizon or {}).get("step_count")
     if step_count is not None:
         cfg = copy.deepcopy(cfg)
         frames = task.reference.num_frames
-        cfg.termination.step_count.max_steps = max(step_count.get("max_steps") or frames, frames)
+        cfg.horizon.step_count.max_steps = max(step_count.get("max_steps") or frames, frames)
     return make_env(cfg, num_envs, task)
 
 

@@ -19,8 +19,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
 from hdmi.assembly import Task, make_task
-from hdmi.assets import Robot
-from hdmi.envs.rendering import WorldRenderer, look_at
+from hdmi.envs.rendering import RenderingError, WorldRenderer, look_at
 from hdmi.evaluation.protocol import (
     Policy,
     evaluation_config,
@@ -44,18 +43,6 @@ _FORCE_SCALE = 0.015  # m/N
 _MAX_ARROW = 0.6  # m
 _MIN_FORCE = 1.0  # N; less is not drawn
 _FRAME_WIDTH = 6  # pixels of the red frame after a failure
-
-
-class RenderingError(RuntimeError):
-    """Nothing can be drawn here; the message says what to install or set.
-
-    Examples:
-        >>> try:
-        ...     raise RenderingError("window=true needs a display")  # as `render_checkpoint` does without OpenGL
-        ... except RuntimeError as error:
-        ...     print(error)
-        window=true needs a display
-    """
 
 
 @dataclass(frozen=True)
@@ -230,7 +217,7 @@ def write_video(
         for moment in moments:
             if renderer is None:
                 # the model of the world, not of the scene: objects are randomized in size
-                renderer = _renderer(moment.model, overlay.task.scene.robot, size)
+                renderer = WorldRenderer(moment.model, overlay.task.scene.robot, *size)
                 writer = imageio.get_writer(partial, fps=fps, codec="libx264", quality=8, macro_block_size=16)
             assert writer is not None
             writer.append_data(picture(renderer, moment, overlay, size))
@@ -245,13 +232,6 @@ def write_video(
             renderer.close()
         partial.unlink(missing_ok=True)
     return path
-
-
-def _renderer(model: mujoco.MjModel, robot: Robot, size: tuple[int, int]) -> WorldRenderer:
-    try:
-        return WorldRenderer(model, robot, *size)
-    except RuntimeError as error:
-        raise RenderingError(str(error)) from error
 
 
 def picture(renderer: WorldRenderer, moment: Moment, overlay: Overlay, size: tuple[int, int] = SIZE) -> np.ndarray:

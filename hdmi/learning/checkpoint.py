@@ -11,7 +11,12 @@ from typing import Any
 import torch
 from filelock import FileLock, Timeout
 
-FORMAT = 3
+FORMAT = 4
+# What the config of an older format has elsewhere; it builds no environment any more.
+_SINCE = {
+    4: "motion_end and step_count are nodes of horizon, per_second and episode_return of returns, and the stack lists "
+    "observation.policy, input.critic, noise, history and input.policy",
+}
 POLICY_FILE = "policy.pt"  # of an exported policy
 
 
@@ -125,6 +130,13 @@ def load_checkpoint(path: str | Path, map_location: str | torch.device = "cpu") 
         raise CheckpointError(
             f"{file}: damaged or not a checkpoint; expected what train.py or scripts/export.py wrote, or its folder"
         ) from error
-    if not isinstance(state, dict) or state.get("format") != FORMAT:
+    found = state.get("format") if isinstance(state, dict) else None
+    if isinstance(found, int) and found < FORMAT:
+        changes = "; ".join(text for number, text in _SINCE.items() if number > found)
+        raise CheckpointError(
+            f"{file}: of format {found}, made by an older version of hdmi, whose config does not fit this one (format "
+            f"{FORMAT}: {changes}); train it again, or use that version"
+        )
+    if found != FORMAT:
         raise CheckpointError(f"{file}: not an hdmi checkpoint of format {FORMAT}")
     return state

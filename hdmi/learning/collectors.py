@@ -22,7 +22,7 @@ from torchrl.modules import ProbabilisticActor
 
 from hdmi.assembly import Task, make_env
 from hdmi.config import ConfigError
-from hdmi.envs import RowResetEnv
+from hdmi.envs import ResetEnv
 from hdmi.learning.checkpoint import CheckpointError
 from hdmi.threads import torch_threads
 
@@ -42,7 +42,7 @@ class WorldCollector(Collector):
     _carrier: TensorDictBase  # from batch to batch; TorchRL gives no access to it
 
     def rollout(self) -> TensorDictBase:
-        with torch_threads(self.env.batch_size.numel()):
+        with torch_threads(self.env.batch_size.numel(), self.env.envs_per_thread):
             return super().rollout()
 
     def state_dict(self) -> dict[str, Any]:  # type: ignore[override]
@@ -320,7 +320,7 @@ class RayCollector(_WorkerCollector):
         self._collector.load_state_dict(states)
 
 
-def _make_worker_env(cfg: DictConfig, task: Task, num_envs: int, num_threads: int, seed: int) -> RowResetEnv:
+def _make_worker_env(cfg: DictConfig, task: Task, num_envs: int, num_threads: int, seed: int) -> ResetEnv:
     """A worker's environment, and its process's threads and random numbers."""
     torch.set_num_threads(num_threads)
     torch.manual_seed(seed)

@@ -27,8 +27,8 @@ KEPT = {
     "run_name": "a continued run stays in its folder",
     "output_dir": "a continued run stays in its folder",
 }
-# What decides the problem, besides the groups of the stack, and the networks' form.
-_PROBLEM = ("stack", "starts", "task", "robot", "sim", "noise", "reference_set", "num_envs")
+# What decides the problem, besides the nodes of the stack, and the networks' form.
+_PROBLEM = ("stack", "starts", "task", "robot", "sim", "reference_set", "num_envs")
 _NETWORKS = ("actor_hidden", "critic_hidden", "activation")
 
 _Path = tuple[str, ...]
@@ -133,8 +133,9 @@ def _is_group(override: Override) -> bool:
     return bool(GlobalHydra.instance().config_loader().get_group_options(override.key_or_group))
 
 
-def _transform_groups(*configs: Mapping[str, Any]) -> set[str]:
-    return {"noise", *(group for config in configs for group in config.get("stack") or ())}
+def _entries(*configs: Mapping[str, Any]) -> list[str]:
+    """What the stacks of configs list, by name."""
+    return sorted({entry for config in configs for entry in config.get("stack") or ()})
 
 
 def _filled(config: dict[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
@@ -142,11 +143,12 @@ def _filled(config: dict[str, Any], defaults: Mapping[str, Any]) -> dict[str, An
 
     A node that would make another experiment of a run that did not have it stays out.
     """
+    groups = {entry.split(".")[0] for entry in _entries(config)}
     for key, default in defaults.items():
         if key in _PROBLEM and key not in config:
             continue
         value = config.setdefault(key, default)
-        if key in _transform_groups(config) or not (isinstance(value, dict) and isinstance(default, dict)):
+        if key in groups or not (isinstance(value, dict) and isinstance(default, dict)):
             continue
         if value.get("_target_") == default.get("_target_"):
             config[key] = value | {name: item for name, item in default.items() if name not in value}
@@ -193,21 +195,28 @@ def problem_changes(run: Mapping[str, Any], config: Mapping[str, Any]) -> list[s
         run, config: before and after, without interpolations. A transform that is null is one that is not there; a
             parameter that `run` did not know yet is none that has changed.
     """
-    groups = _transform_groups(run, config)
     nodes: list[str] = []
-    for key in dict.fromkeys([*_PROBLEM, *sorted(groups)]):
+    for key in _PROBLEM:
         old, new = run.get(key), config.get(key)
-        if key in groups:
-            old, new = _without_nulls(old), _without_nulls(new)
-        elif isinstance(old, Mapping) and isinstance(new, Mapping):
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
             new = {name: value for name, value in new.items() if name in old}
-        depth = 3 if key == "observation" else 2
-        nodes += [".".join(path.split(".")[:depth]) for path in differences(old, new, (key,))]
+        nodes += [".".join(path.split(".")[:2]) for path in differences(old, new, (key,))]
+    for entry in _entries(run, config):
+        path = tuple(entry.split("."))
+        old, new = (_without_nulls(_at(values, path)) for values in (run, config))
+        depth = len(path) + ("_target_" not in {*old, *new})
+        nodes += [".".join(changed.split(".")[:depth]) for changed in differences(old, new, path)]
     algo, other = run["algo"], config["algo"]
     nodes += [f"algo.{name}" for name in _NETWORKS if name in algo and algo[name] != other.get(name)]
     if run["collector"].get("num_workers") != config["collector"].get("num_workers"):
         nodes.append("collector")
     return list(dict.fromkeys(nodes))
+
+
+def _at(config: Any, path: _Path) -> Any:
+    for key in path:
+        config = (config or {}).get(key)
+    return config
 
 
 def _without_nulls(node: Any) -> Any:

@@ -52,7 +52,7 @@ def render_reference(task: Task, path: str | Path, size: tuple[int, int] = (360,
     """A picture of the reference at mid-contact, from where robot, object and end effectors are seen best.
 
     Raises:
-        RuntimeError: without OpenGL; says what to install.
+        RenderingError: without OpenGL; says what to install.
         ConfigError: for a format that pictures cannot have.
     """
     path = Path(path)

@@ -22,6 +22,7 @@ from hdmi.transforms.action import (
     JointPositionAction,
     ResidualAction,
 )
+from hdmi.transforms.concatenate import Concatenate
 from hdmi.transforms.observation import (
     Difference,
     EpisodeNoise,
@@ -97,6 +98,7 @@ __all__ = [
     "BodyHeight",
     "BodyHeightError",
     "CenterOfMassRandomization",
+    "Concatenate",
     "ContactMade",
     "ContactPoints",
     "DefaultPoseAction",

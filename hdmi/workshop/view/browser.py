@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import trimesh
 
-from hdmi.evaluation.video import RenderingError
+from hdmi.envs.rendering import RenderingError
 from hdmi.motion.playback import Playback
 from hdmi.workshop.view.curves import curves
 

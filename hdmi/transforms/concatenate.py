@@ -1,0 +1,29 @@
+"""What a network is given: observation terms side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from tensordict import NestedKey
+from torchrl.envs import CatTensors
+
+
+class Concatenate(CatTensors):
+    """Concatenates what groups of the stack have written, in the order of groups and of the nodes in them.
+
+    Reads the groups' entries [N, D_i], as they are by then; writes `out_key` [N, sum of D_i].
+
+    Args:
+        groups: entries of the stack that stand before.
+        out_key: of the vector.
+        written: entry of the stack -> keys that its transforms write.
+
+    Raises:
+        ValueError: for a group that does not stand before.
+    """
+
+    def __init__(self, groups: Sequence[str], out_key: NestedKey, written: Mapping[str, Sequence[NestedKey]]):
+        if missing := [group for group in groups if group not in written]:
+            raise ValueError(f"groups: {missing} do not stand before it in the stack; there is {list(written)}")
+        keys = [key for group in groups for key in written[group]]
+        super().__init__(in_keys=keys, out_key=out_key, dim=-1, del_keys=False, sort=False)
