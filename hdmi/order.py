@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import torch
 from tensordict import NestedKey, unravel_key
 from torchrl.envs import EnvBase, RewardSum, Transform
 
@@ -85,8 +84,7 @@ def written_keys(transform: Transform) -> set[NestedKey]:
     """What a transform adds to a step or a reset."""
     keys = [*(transform.out_keys or ()), *(transform.out_keys_inv or ())]
     if isinstance(transform, StateTransform):
-        with torch.random.fork_rng():  # state may be drawn
-            keys += transform.initial_state(torch.Size([1]), None)
+        keys += transform.own_keys
     return {unravel_key(key) for key in keys}
 
 

@@ -9,6 +9,7 @@ from torchrl.envs import RewardSum, Transform
 
 from hdmi import transforms as T
 from hdmi.assembly import make_env, make_task, make_transforms
+from hdmi.assets import g1
 from hdmi.config import ConfigError, task_files
 from hdmi.envs import HumanoidObjectEnv
 from hdmi.order import RULES, Stack, check_order, check_reads
@@ -26,7 +27,7 @@ def mass(bodies: str, per: str) -> Transform:
 
 def starts(adaptive: bool = False) -> Transform:
     cls = T.AdaptiveStateInitialization if adaptive else T.ReferenceStateInitialization
-    return cls(lift_box().reference)
+    return cls(lift_box().reference, g1.JOINT_RANGES)
 
 
 def noise(key: str = "x") -> Transform:
@@ -38,7 +39,7 @@ def history(key: str = "x") -> Transform:
 
 
 def joints() -> Transform:
-    return T.JointPositionAction({".*": 0.5})
+    return T.JointPositionAction({".*": 0.5}, g1.JOINT_NAMES)
 
 
 def failure() -> Transform:
@@ -56,9 +57,9 @@ WRONG: dict[str, tuple[Transform, Transform, str]] = {
     "worlds": (mass("box", "world"), mass("pelvis", "episode"), "untouched model"),
     "delay": (T.ActionSmoothing(), T.ActionDelay([1, 2], 4), "the last thing that happens to a target"),
     "late offsets": (T.ResidualAction(), T.ActionDelay([1, 2], 4), "targets that are delayed"),
-    "smooth offsets": (T.DefaultPoseAction(), T.ActionSmoothing(), "targets that are smoothed"),
+    "smooth offsets": (T.DefaultPoseAction([0.0]), T.ActionSmoothing(), "targets that are smoothed"),
     "target": (joints(), T.ResidualAction(), "makes joint angles"),
-    "default": (joints(), T.DefaultPoseAction(), "makes joint angles"),
+    "default": (joints(), T.DefaultPoseAction([0.0]), "makes joint angles"),
     "offset": (joints(), T.JointOffset(0.01), "makes joint angles"),
     "survival": (T.SurvivalReward(), failure(), "`terminated`"),
     "end": (T.MotionEnd(lift_box().reference), failure(), "`terminated`"),
@@ -77,7 +78,7 @@ WRONG: dict[str, tuple[Transform, Transform, str]] = {
 def test_both_nodes_are_named(case: str):
     early, late, why = WRONG[case]
     names = f"a.late ({type(late).__name__}) has to stand before b.early ({type(early).__name__}): "
-    clock = ("c.clock", T.MotionReference(lift_box().reference, ["pelvis"], [".*"]))
+    clock = ("c.clock", T.MotionReference(lift_box().reference, ["pelvis"], [".*"], g1.BODY_NAMES, g1.JOINT_NAMES))
     with pytest.raises(ConfigError) as told:
         check_order([("b.early", early), clock, ("a.late", late)])
     assert str(told.value).startswith(f"stack: {names}")
@@ -131,9 +132,9 @@ class TestReads:
     def test_of_state_that_comes_later(self):
         feet = T.FeetState(0.02)
         with pytest.raises(ConfigError, match=r"a\.impact .*'force'\), which b\.feet \(FeetState\) writes only after"):
-            self.check(("a.impact", T.FeetImpactL2()), ("b.feet", feet))
+            self.check(("a.impact", T.FeetImpactL2(35.0)), ("b.feet", feet))
 
-    @pytest.mark.parametrize("reader", [noise("z"), T.ResidualAction(("obs", "z")), T.FeetImpactL2()])
+    @pytest.mark.parametrize("reader", [noise("z"), T.ResidualAction(("obs", "z")), T.FeetImpactL2(35.0)])
     def test_of_what_nothing_writes(self, reader: Transform):
         with pytest.raises(ConfigError, match=r"^stack: a\.node \(\w+\) reads .*, which nothing before it writes$"):
             self.check(("a.node", reader))
@@ -204,7 +205,7 @@ def test_a_task_may_add_terms_of_its_own():
     """New nodes come last in their groups, which is early enough."""
     cfg = load_config(
         "+reward.mine={_target_: hdmi.transforms.JointVelL2, weight: -1}",
-        "+termination.mine={_target_: hdmi.transforms.BodyHeight}",
+        "+termination.mine={_target_: hdmi.transforms.BodyHeight, body: torso_link}",
         "+observation.policy.mine={_target_: hdmi.transforms.Flatten, in_key: [robot, root_pos], out_key: [obs, mine]}",
         "+noise.mine={_target_: hdmi.transforms.UniformNoise, key: [obs, joint_pos], scale: 0.1}",
         "+history.mine={_target_: hdmi.transforms.History, key: [obs, mine], steps: 1}",

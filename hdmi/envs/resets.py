@@ -46,6 +46,16 @@ class ResetEnv(SteppedEnv):
 
     Raises:
         TypeError: for a transform of TorchRL's that a reset of some environments would corrupt; says what to use.
+
+    Examples:
+        >>> from torchrl.envs import CatFrames, Compose
+        >>> from hdmi.assets import RobotConfig, SimConfig, build_scene
+        >>> base = HumanoidObjectEnv(build_scene(RobotConfig(), SimConfig()), num_envs=1)
+        >>> try:
+        ...     RowResetEnv(base, Compose(CatFrames(2, -1, in_keys=[("robot", "joint_pos")])))
+        ... except TypeError as error:
+        ...     print("History" in str(error))
+        True
     """
 
     def __init__(

@@ -214,6 +214,10 @@ class ActionSmoothing(ActionStateTransform):
             raise ValueError(f"action.smoothing.alpha: expected 0 < low <= high <= 1, got {list(alpha)}")
         self.low, self.high = float(low), float(high)
 
+    @property
+    def own_keys(self) -> list[NestedKey]:
+        return [self._previous, self._alpha, self._fresh]
+
     def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
         alpha = self.low + (self.high - self.low) * torch.rand(*batch_size, 1, device=device)
         return {
@@ -278,6 +282,10 @@ class ActionDelay(ActionStateTransform):
         self._targets = below(key, "targets")  # from the way in to the end of the same step
         self.depth = -(-self.high // decimation)  # control steps to remember
 
+    @property
+    def own_keys(self) -> list[NestedKey]:
+        return [self._history, self._substeps, self._fresh]
+
     def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
         return {
             self._history: torch.zeros(*batch_size, max(self.depth, 1), self.size, device=device),
@@ -336,6 +344,10 @@ class ActionHistory(StateTransform):
         super().__init__(out_keys=[key_of(out_key)])
         self.steps, self._size = steps, size
         self.action_key, self.env_action_key = key_of(action_key), key_of(env_action_key)
+
+    @property
+    def own_keys(self) -> list[NestedKey]:
+        return [self.out_keys[0]]
 
     def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
         if self._size is None:

@@ -131,6 +131,12 @@ class StateTransform(SpecTransform):
     that a parallel environment sends them back to its workers).
     """
 
+    @property
+    def own_keys(self) -> list[NestedKey]:
+        """Keys of the state."""
+        with torch.random.fork_rng():  # it may be drawn
+            return list(self.initial_state(torch.Size([1]), None))
+
     def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
         """State of fresh episodes, for all rows."""
         raise NotImplementedError

@@ -20,6 +20,12 @@ class Concatenate(CatTensors):
 
     Raises:
         ValueError: for a group that does not stand before.
+
+    Examples:
+        >>> both = Concatenate(["body", "thing"], "policy", {"body": ["height"], "thing": ["mass"]})
+        >>> data = TensorDict({"height": torch.tensor([[0.5]]), "mass": torch.tensor([[2.0]])}, batch_size=[1])
+        >>> both(data)["policy"].tolist()
+        [[0.5, 2.0]]
     """
 
     def __init__(self, groups: Sequence[str], out_key: NestedKey, written: Mapping[str, Sequence[NestedKey]]):

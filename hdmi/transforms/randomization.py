@@ -349,6 +349,10 @@ class JointOffset(ActionStateTransform):
         self.offset = offset
         self.state_key = below("joint_offset", self.action_key) if state_key is None else key_of(state_key)
 
+    @property
+    def own_keys(self) -> list[NestedKey]:
+        return [self.state_key]
+
     def initial_state(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
         return {self.state_key: _between((-self.offset, self.offset), (*batch_size, self.size), device)}
 
