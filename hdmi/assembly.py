@@ -30,7 +30,7 @@ from hdmi.envs import HumanoidObjectEnv, MaskedResetEnv, PhysicsBackend, ResetEn
 from hdmi.envs.resets import check_row_resets
 from hdmi.motion import Reference, find_motion, make_reference
 from hdmi.motion.starts import StartTables, start_tables
-from hdmi.order import check_order, check_reads
+from hdmi.order import check_order, check_reads, listed_keys, read_keys
 from hdmi.transforms import KernelReward, KernelTermination
 
 # What leaves the stack besides the state that steps read back.
@@ -259,7 +259,7 @@ def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
         for where, node in _nodes(cfg, entry):
             transform = build(node, where, name=where.rpartition(".")[2], written=written, **context)
             stack.append((where, transform))
-            keys += transform.out_keys or []
+            keys += listed_keys(transform, "out_keys") or ()
         written[entry] = keys
     check_order(stack)
     return stack
@@ -295,8 +295,8 @@ def describe(transforms: list[tuple[str, Transform]]) -> Table:
         return ", ".join(shown[:4]) + (f", ... ({len(shown)})" if len(shown) > 4 else "")
 
     for name, transform in transforms:
-        reads = [*(transform.in_keys or []), *getattr(transform, "state_keys", []), *(transform.in_keys_inv or [])]
-        writes = [*(transform.out_keys or []), *(transform.out_keys_inv or [])]
+        reads = [*read_keys(transform), *(listed_keys(transform, "in_keys_inv") or ())]
+        writes = [key for name in ("out_keys", "out_keys_inv") for key in listed_keys(transform, name) or ()]
         weight = getattr(transform, "weight", None)
         table.add_row(name, _class_of(transform), text(reads), text(writes), "" if weight is None else f"{weight:g}")
     return table

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from tensordict import NestedKey, unravel_key
-from torchrl.envs import EnvBase, RewardSum, Transform
+from torchrl.envs import EnvBase, RewardSum, StepCounter, Transform
 
 from hdmi.config import ConfigError
 from hdmi.transforms import (
@@ -75,16 +75,28 @@ class Before:
         return None
 
 
+def listed_keys(transform: Transform, name: str) -> list[NestedKey] | None:
+    """One of a transform's lists of keys; None for those of TorchRL's that find their keys in an environment only."""
+    try:
+        return getattr(transform, name)
+    except (AttributeError, NotImplementedError):
+        return None
+
+
 def read_keys(transform: Transform) -> list[NestedKey]:
-    """What a transform reads of a step or a reset that comes from the environment."""
-    return [unravel_key(key) for key in (*(transform.in_keys or ()), *getattr(transform, "state_keys", ()))]
+    """What a transform reads of a step or a reset that comes from the environment, as far as it says so."""
+    return [
+        unravel_key(key) for key in (*(listed_keys(transform, "in_keys") or ()), *getattr(transform, "state_keys", ()))
+    ]
 
 
 def written_keys(transform: Transform) -> set[NestedKey]:
-    """What a transform adds to a step or a reset."""
-    keys = [*(transform.out_keys or ()), *(transform.out_keys_inv or ())]
+    """What a transform adds to a step or a reset, as far as it says so."""
+    keys = [*(listed_keys(transform, "out_keys") or ()), *(listed_keys(transform, "out_keys_inv") or ())]
     if isinstance(transform, StateTransform):
         keys += transform.own_keys
+    if isinstance(transform, StepCounter):
+        keys.append(transform.step_count_key)
     return {unravel_key(key) for key in keys}
 
 
@@ -186,14 +198,16 @@ def check_order(stack: Stack) -> None:
 def check_reads(stack: Stack, base: EnvBase) -> None:
     """Checks that what each transform reads is there by then, from the base environment or a transform before it.
 
+    Behind a transform that does not say what it writes, only what comes too late is known.
+
     Raises:
         ConfigError: for the first that is not; names the reader, and who writes it too late.
     """
     spec = base.output_spec
     groups = ("full_observation_spec", "full_reward_spec", "full_done_spec")
     there = {unravel_key(key) for group in groups for key in spec[group].keys(True, True)}
+    all_known = True
     for i, (node, transform) in enumerate(stack):
-        written = written_keys(transform)
         for key in read_keys(transform):
             if key in there:
                 continue
@@ -201,5 +215,7 @@ def check_reads(stack: Stack, base: EnvBase) -> None:
             reads = f"{_named(node, transform)} reads {key!r}, which"
             if late:
                 raise ConfigError(f"stack: {reads} {late[0]} writes only after it: {late[0]} has to stand before")
-            raise ConfigError(f"stack: {reads} nothing before it writes")
-        there |= written
+            if all_known:
+                raise ConfigError(f"stack: {reads} nothing before it writes")
+        there |= written_keys(transform)
+        all_known &= listed_keys(transform, "out_keys") is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from mocks import CONF, ScriptedEnv, lift_box, load_config, make_script
-from torchrl.envs import RewardSum, Transform
+from torchrl.envs import InitTracker, RewardSum, StepCounter, Transform
 
 from hdmi import transforms as T
 from hdmi.assembly import make_env, make_task, make_transforms
@@ -138,6 +138,13 @@ class TestReads:
     def test_of_what_nothing_writes(self, reader: Transform):
         with pytest.raises(ConfigError, match=r"^stack: a\.node \(\w+\) reads .*, which nothing before it writes$"):
             self.check(("a.node", reader))
+
+    def test_behind_what_finds_its_keys_in_an_environment(self):
+        reader = ("c.flat", T.Flatten("step_count", ("obs", "z")))
+        self.check(("a.count", StepCounter()), reader)
+        self.check(("a.init", InitTracker()), ("b.flat", T.Flatten("is_init", ("obs", "z"))))
+        with pytest.raises(ConfigError, match=r"c\.flat .*'step_count', which d\.count \(StepCounter\) writes only"):
+            self.check(("a.init", InitTracker()), reader, ("d.count", StepCounter()))
 
     def test_draws_no_random_numbers(self):
         torch.manual_seed(0)

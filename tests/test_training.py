@@ -22,12 +22,12 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives.value import GAE
 
 from hdmi.commands.train import open_run, run_folder
-from hdmi.evaluation.protocol import training_figures
 from hdmi.learning import CheckpointError, RunningNorm, Trainer, load_checkpoint, load_policy, save_checkpoint
 from hdmi.learning.checkpoint import FORMAT, checkpoints, claim
 from hdmi.learning.networks import bound_noise, make_actor, network_of, normalised_networks
 from hdmi.learning.policy import export_policy, make_networks
 from hdmi.learning.trainer import DivergenceError
+from hdmi.metrics import read_rows
 
 ROOT = Path(__file__).parents[1]
 TINY = [
@@ -122,17 +122,17 @@ class TestRun:
         mean, actor = network_of(trainer.averaged.module).norm, network_of(trainer.actor).norm
         torch.testing.assert_close(mean.mean, actor.mean, rtol=0, atol=0)
 
-    def test_that_mean_is_what_is_evaluated(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        trainer = Trainer(config("eval_interval=4"), tmp_path, training_figures)
+    def test_that_mean_is_what_is_evaluated(self, tmp_path: Path) -> None:
         evaluated: list[torch.nn.Module] = []
 
-        def noted(actor: torch.nn.Module, *args: object, **kwargs: object) -> dict[str, float]:
+        def noted(actor: torch.nn.Module, *_: object) -> dict[str, float]:
             evaluated.append(actor)
-            return {}
+            return {"eval/success_rate": 0.5}
 
-        monkeypatch.setattr("hdmi.evaluation.evaluate_policy", noted)
+        trainer = Trainer(config("eval_interval=4"), tmp_path, noted)
         trainer.run()
         assert evaluated == [trainer.averaged.module]
+        assert [row["eval/success_rate"] for row in read_rows(tmp_path / "metrics.csv")[1]][-1] == "0.5"
 
 
 class TestResume:

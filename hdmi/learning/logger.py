@@ -24,7 +24,8 @@ class LoggerError(RuntimeError):
 class RunLogger:
     """Appends rows to `metrics.csv` and sends them to W&B, where a run and its continuations are one.
 
-    A row that cannot be written (full disk) is reported and counted, not fatal.
+    A row that cannot be written (full disk) is reported and counted, not fatal. TorchRL's CSVLogger writes a file for
+    each figure, and its WandbLogger steps that only grow, which those of a continued run do not.
 
     Args:
         cfg: the whole config; `cfg.logger.wandb` is null or {mode, project}.

@@ -17,6 +17,9 @@ _MIN_STD, _MAX_STD = 0.05, 2.0
 class RunningNorm(nn.Module):
     """Normalises features by moments that `update` accumulates; gradients do not reach them.
 
+    TorchRL's VecNormV2 updates its moments in every step; these stay as they are while a policy is compared with the
+    one that collected.
+
     Args:
         size: features.
         clip: bound of the normalised values.

@@ -19,7 +19,7 @@ class Concatenate(CatTensors):
         written: entry of the stack -> keys that its transforms write.
 
     Raises:
-        ValueError: for a group that does not stand before.
+        ValueError: for a group that does not stand before, or an entry that they write twice.
 
     Examples:
         >>> both = Concatenate(["body", "thing"], "policy", {"body": ["height"], "thing": ["mass"]})
@@ -32,4 +32,6 @@ class Concatenate(CatTensors):
         if missing := [group for group in groups if group not in written]:
             raise ValueError(f"groups: {missing} do not stand before it in the stack; there is {list(written)}")
         keys = [key for group in groups for key in written[group]]
+        if twice := sorted({str(key) for key in keys if keys.count(key) > 1}):
+            raise ValueError(f"groups: {', '.join(twice)} written by more than one transform")
         super().__init__(in_keys=keys, out_key=out_key, dim=-1, del_keys=False, sort=False)
