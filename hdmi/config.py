@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import fields
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
@@ -16,6 +21,9 @@ from yaml import YAMLError
 
 # beside the package in a checkout, in the package when it is installed
 CONF = next(path for path in (Path(__file__).parent / "conf", Path(__file__).parents[1] / "conf") if path.is_dir())
+
+
+_ENTRY_POINTS = "hdmi.configs"  # by which packages name their config folders
 
 
 class ConfigError(ValueError):
@@ -122,21 +130,63 @@ def choose_engine(cfg: DictConfig, name: str) -> None:
         cfg.sim.device, cfg.sim.backend = sim.device, sim.backend
 
 
-def task_files(config_dir: str | Path | None = None) -> dict[str, Path]:
-    """The tasks of conf/task, and of `config_dir`/task, by name.
+def installed_configs() -> dict[str, Path]:
+    """Config folders of installed packages, by the name of the package.
+
+    A package names its folder with an entry point of the group `hdmi.configs`, such as `tasks = "my_package.conf"`.
 
     Raises:
-        ConfigError: if there is no such folder, or both have a task of one name.
+        ConfigError: if there is no such folder; names the package.
+    """
+    found = {}
+    for entry in entry_points(group=_ENTRY_POINTS):
+        package = entry.dist.name if entry.dist is not None else entry.name
+        try:
+            spec = find_spec(entry.value)
+        except ImportError:
+            spec = None
+        folders = [] if spec is None else list(spec.submodule_search_locations or ())
+        if not folders:
+            raise ConfigError(
+                f"package {package}: its entry point {entry.name!r} of {_ENTRY_POINTS} names {entry.value}, which "
+                "is no package with a folder"
+            )
+        found[package] = Path(folders[0])
+    return found
+
+
+class _InstalledConfigs(SearchPathPlugin):
+    """Config folders of installed packages on Hydra's search path."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for package, folder in installed_configs().items():
+            search_path.append(package, f"file://{folder}")
+
+
+def use_installed_configs() -> None:
+    """Puts config folders of installed packages on the search path of whatever Hydra composes from now on."""
+    installed_configs()  # what is wrong with one is said here, and not from inside of Hydra
+    plugins = Plugins.instance()
+    if _InstalledConfigs not in plugins.discover(SearchPathPlugin):
+        plugins.register(_InstalledConfigs)
+
+
+def task_files(config_dir: str | Path | None = None) -> dict[str, Path]:
+    """The tasks of conf/task, of installed packages, and of `config_dir`/task, by name.
+
+    Raises:
+        ConfigError: if there is no such folder, or two have a task of one name.
     """
     found = {path.stem: path for path in (CONF / "task").glob("*.yaml")}
+    folders = {f"package {package}": folder for package, folder in installed_configs().items()}
     if config_dir is not None:
         if not (folder := Path(config_dir).expanduser()).is_dir():
             raise ConfigError(f"config_dir: no folder {folder}")
+        folders["config_dir"] = folder
+    for where, folder in folders.items():
         own = {path.stem: path for path in (folder / "task").glob("*.yaml")}
         if twice := sorted(set(own) & set(found)):
-            raise ConfigError(
-                f"config_dir: {own[twice[0]]}: there is a task {twice[0]!r} already; give it another name"
-            )
+            raise ConfigError(f"{where}: {own[twice[0]]}: there is a task {twice[0]!r} already; give it another name")
         found |= own
     return dict(sorted(found.items()))
 
@@ -150,6 +200,7 @@ def task_config(task: str, motion_root: str | None = None, config_dir: str | Pat
     Raises:
         ConfigError: if there is no such task, or its file cannot be composed.
     """
+    use_installed_configs()
     if task not in (files := task_files(config_dir)):
         hint = "; config_dir=FOLDER adds those of FOLDER/task" if config_dir is None else ""
         raise ConfigError(f"task: there is no {task!r}; there is {', '.join(files)}{hint}")

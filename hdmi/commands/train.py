@@ -21,7 +21,7 @@ from rich.markup import escape
 
 from hdmi.assembly import describe, make_transforms
 from hdmi.commands.script import USER_ERRORS
-from hdmi.config import CONF
+from hdmi.config import CONF, ConfigError, use_installed_configs
 from hdmi.console import make_console
 from hdmi.evaluation import RenderingError, evaluate_checkpoint, render_checkpoint
 from hdmi.evaluation.protocol import training_figures
@@ -144,6 +144,15 @@ def run_folder(cfg: DictConfig) -> Path:
 
 
 @hydra.main(config_path=str(CONF), config_name="config", version_base="1.3")
-def main(cfg: DictConfig) -> None:
-    """Trains under the config that the command line composes."""
+def _composed(cfg: DictConfig) -> None:
     train(cfg)
+
+
+def main() -> None:
+    """Trains under the config that the command line composes."""
+    try:
+        use_installed_configs()
+    except ConfigError as error:
+        print(f"ConfigError: {error}", file=sys.stderr)
+        sys.exit(2)
+    _composed()
