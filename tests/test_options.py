@@ -273,9 +273,7 @@ def test_faults_of_a_scene_name_the_node(fault: str, tmp_path: Path):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "script", ["annotate", "validate", "view", "tasks", "play", "evaluate", "author", "retarget"]
-)
+@pytest.mark.parametrize("script", ["annotate", "validate", "view", "tasks", "play", "evaluate", "author", "retarget"])
 def test_every_script_says_what_is_wrong_with_a_scene(
     script: str, scripts: dict[str, list[str]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
