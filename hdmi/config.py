@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
 from dataclasses import fields
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -12,7 +13,7 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.plugins import Plugins
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -127,6 +128,17 @@ def one_line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
+def composition_fault(error: Exception) -> str:
+    """What keeps Hydra from composing a config, on one line: with the names that there are, without the search path."""
+    said = " ".join(str(error).split("\n\n")[0].split())
+    if isinstance(error, MissingConfigException) and error.options:
+        said = f"{said}; there is {', '.join(error.options)}"
+    if isinstance(error.__cause__, OmegaConfBaseException):
+        reason = str(error.__cause__).splitlines()[0]
+        said = f"{said}: {reason}" if said else reason
+    return said
+
+
 def choose_engine(cfg: DictConfig, name: str) -> None:
     """Changes which engine computes the physics of a config, and nothing else about it.
 
@@ -145,36 +157,47 @@ def choose_engine(cfg: DictConfig, name: str) -> None:
         cfg.sim.device, cfg.sim.backend = sim.device, sim.backend
 
 
-def installed_configs() -> dict[str, Path]:
-    """Config folders of installed packages, by the name of the package.
+def installed_configs() -> dict[Path, str]:
+    """Config folders of installed packages, with the name of the package of each.
 
-    A package names its folder with an entry point of the group `hdmi.configs`, such as `tasks = "my_package.conf"`.
+    A package names a folder with an entry point of the group `hdmi.configs`, such as `tasks = "my_package.conf"`.
 
     Raises:
-        ConfigError: if there is no such folder; names the package.
+        ConfigError: if there is no such folder, or it has a config that conf or another package has; names the package.
     """
-    found = {}
+    found: dict[Path, str] = {}
     for entry in entry_points(group=_ENTRY_POINTS):
         package = entry.dist.name if entry.dist is not None else entry.name
+        where = f"package {package}: its entry point {entry.name!r} of {_ENTRY_POINTS} names {entry.value}, which"
         try:
             spec = find_spec(entry.value)
-        except ImportError:
-            spec = None
-        folders = [] if spec is None else list(spec.submodule_search_locations or ())
-        if not folders:
-            raise ConfigError(
-                f"package {package}: its entry point {entry.name!r} of {_ENTRY_POINTS} names {entry.value}, which "
-                "is no package with a folder"
-            )
-        found[package] = Path(folders[0])
+        except Exception as error:  # whatever the package's own code raises
+            raise ConfigError(f"{where} cannot be imported: {type(error).__name__}: {one_line(error)}") from error
+        folders = [] if spec is None else [Path(path) for path in spec.submodule_search_locations or ()]
+        if not folders or not folders[0].is_dir():
+            raise ConfigError(f"{where} is no package with a folder")
+        found[folders[0]] = package
+    if found:
+        _refuse_twins(found)
     return found
+
+
+def _refuse_twins(folders: Mapping[Path, str]) -> None:
+    """Raises ConfigError for a config that conf, or a package before it, has as well: Hydra would take that one."""
+    taken = {path.relative_to(CONF): path for path in CONF.rglob("*.yaml")}
+    for folder, package in folders.items():
+        for path in sorted(folder.rglob("*.yaml")):
+            name = path.relative_to(folder)
+            if name in taken:
+                raise ConfigError(f"package {package}: {path}: there is {taken[name]} already; give it another name")
+            taken[name] = path
 
 
 class _InstalledConfigs(SearchPathPlugin):
     """Config folders of installed packages on Hydra's search path."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        for package, folder in installed_configs().items():
+        for folder, package in installed_configs().items():
             search_path.append(package, f"file://{folder}")
 
 
@@ -192,16 +215,15 @@ def task_files(config_dir: str | Path | None = None) -> dict[str, Path]:
     Raises:
         ConfigError: if there is no such folder, or two have a task of one name.
     """
-    found = {path.stem: path for path in (CONF / "task").glob("*.yaml")}
-    folders = {f"package {package}": folder for package, folder in installed_configs().items()}
+    found = {path.stem: path for folder in (CONF, *installed_configs()) for path in (folder / "task").glob("*.yaml")}
     if config_dir is not None:
         if not (folder := Path(config_dir).expanduser()).is_dir():
             raise ConfigError(f"config_dir: no folder {folder}")
-        folders["config_dir"] = folder
-    for where, folder in folders.items():
         own = {path.stem: path for path in (folder / "task").glob("*.yaml")}
         if twice := sorted(set(own) & set(found)):
-            raise ConfigError(f"{where}: {own[twice[0]]}: there is a task {twice[0]!r} already; give it another name")
+            raise ConfigError(
+                f"config_dir: {own[twice[0]]}: there is a task {twice[0]!r} already; give it another name"
+            )
         found |= own
     return dict(sorted(found.items()))
 
@@ -228,6 +250,6 @@ def task_config(task: str, motion_root: str | None = None, config_dir: str | Pat
         with initialize_config_dir(str(CONF), version_base="1.3"):
             cfg = compose("config", overrides=overrides)
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
-        raise ConfigError(f"{files[task]}: {' '.join(str(error).split(chr(10) * 2)[0].split())}") from error
+        raise ConfigError(f"{files[task]}: {composition_fault(error)}") from error
     cfg.motion_root = motion_root
     return cfg

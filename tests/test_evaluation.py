@@ -304,7 +304,7 @@ def test_pictures_beyond_the_usual_sizes(size: tuple[int, int]):
     model = lift_box().scene.model
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    renderer = WorldRenderer(model, 32, 32)
+    renderer = WorldRenderer(model, lift_box().scene.robot, 32, 32)
     assert renderer(model, data, *size).shape == (*size, 3)
     renderer.close()
 
@@ -312,7 +312,7 @@ def test_pictures_beyond_the_usual_sizes(size: tuple[int, int]):
 @pytest.mark.parametrize("size", [(0, 64), (64, -1), (64, 100_000)])
 def test_pictures_of_impossible_sizes(size: tuple[int, int]):
     with pytest.raises(RenderingError, match=f"pictures of {size[1]} x {size[0]} pixels: expected 1 to 8192"):
-        WorldRenderer(lift_box().scene.model, *size)
+        WorldRenderer(lift_box().scene.model, lift_box().scene.robot, *size)
 
 
 def short(moments: Iterator[video.Moment], count: int = 4) -> Iterator[video.Moment]:

@@ -526,7 +526,7 @@ class TestHands:
             reference = make_reference(folder, control_dt=0.02)
         np.testing.assert_allclose(reference.joint_pos, angles(), atol=1e-6)
 
-        from validate_motion import main
+        from hdmi.commands.validate import main
 
         with pytest.warns(UserWarning, match="joints of hands"):
             main([str(folder), "task=none"])

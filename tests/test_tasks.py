@@ -25,6 +25,7 @@ from torchrl.envs.utils import ExplorationType, check_env_specs, exploration_typ
 from hdmi.assembly import Task, make_env, make_task, make_transforms, scene_parts
 from hdmi.assets import default_joint_pos, g1, g1_robot
 from hdmi.config import ConfigError, task_files
+from hdmi.evaluation import EvalResult
 from hdmi.evaluation.agents import BlindAgent
 from hdmi.motion import Motion, find_motion, forward_kinematics, load_motion, save_motion
 from hdmi.tasks.catalogue import list_tasks, sources
@@ -318,7 +319,20 @@ class TestCheck:
         assert Training(after, before).chance > 0.99
         assert Training(before, before).chance == pytest.approx(0.5, abs=0.1)
 
-    def test_a_training_that_makes_it_worse_fails(self):
+    @pytest.fixture
+    def only_training(self):
+        """Without a policy the task is what it is: checks that are about the training alone need not look again."""
+        stub = EvalResult({"survival": {"mean": 1.0, "std": 0.0}})
+        with patch.multiple("hdmi.tasks.check", evaluate_policy=lambda *_: stub, check_env_specs=lambda *_: None):
+            yield
+
+    def test_trains(self, only_training):
+        with patch.multiple("hdmi.tasks.check", _RETURN_ENVS=4, _RETURN_STEPS=4):
+            training = check_task("lift_box", frames=256, num_envs=4, num_threads=1).training
+        assert training.before.shape == training.after.shape == (4,)
+        assert not np.array_equal(training.before, training.after)
+
+    def test_a_training_that_makes_it_worse_fails(self, only_training):
         worse, better = np.arange(20.0), np.arange(1.0, 21.0)
         for training, problems in ((Training(worse, better), 0), (Training(better, worse), 1)):
             with patch("hdmi.tasks.check._train", return_value=training):
@@ -327,7 +341,7 @@ class TestCheck:
             assert all("training of 2 frames: " in problem for problem in found)
             assert all("in the median by -1.000" in problem for problem in found)
 
-    def test_a_second_training_has_twice_as_many_frames(self):
+    def test_a_second_training_has_twice_as_many_frames(self, only_training):
         worse, better, asked = np.arange(20.0), np.arange(1.0, 21.0), []
 
         def train(cfg, task):
@@ -378,10 +392,8 @@ class TestCheck:
     COMMAND = (sys.executable, str(ROOT / "scripts" / "tasks.py"))
 
     def test_script(self):
-        options = ["check", "lift_box", "frames=1024", "num_envs=16", "jobs=1"]
-        result = subprocess.run([*self.COMMAND, *options], capture_output=True, text=True, timeout=300)
-        # so short a training may or may not improve; everything else must pass
-        assert result.returncode in (0, 1), result.stderr
+        result = subprocess.run([*self.COMMAND, "check", "lift_box", "frames=0"], capture_output=True, text=True)
+        assert result.returncode == 0, result.stderr
         assert "1/1 lift_box" in result.stdout
         assert "labels" not in result.stdout
         assert "specs" not in result.stdout

@@ -413,7 +413,7 @@ def test_states_of_entries_with_one_last_name():
     assert step["critic", "x"][0].tolist() == [2.0, 2.0]
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [name for name in CASES if name != "Concatenate"])  # TorchRL's CatTensors, which edits
 def test_specs_that_are_given_are_left_alone(name):
     env, transform = base(CASES[name]), CASES[name].make()
     around = wrap(env, transform)

@@ -3,9 +3,9 @@
     hdmi author task=NAME [plan=FILE] [out=FOLDER] [config_dir=FOLDER]
 
 The plan is the one that ships for the task unless `plan` names a file; what it may hold is in docs/authoring.md and
-hdmi/workshop/author/plan.py. Object, scenery and end effectors are the task's, which
-`config_dir`/task may have instead of conf/task. The motion is written to `out`/<plan's
-name>, `motions` if absent, so that `python train.py task=NAME motion_root=motions` trains on it.
+hdmi/workshop/author/plan.py. Object, scenery and end effectors are the task's, which `config_dir`/task may have instead
+of conf/task. The motion is written to `out`/<plan's name>, `motions` if absent, so that `hdmi train task=NAME
+motion_root=motions` trains on it.
 """
 
 from __future__ import annotations

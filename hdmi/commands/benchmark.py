@@ -1,10 +1,12 @@
 """Speed of raw physics, of the environment with all transforms, of the learner and of training, in one run.
 
-`hdmi benchmark [any option of train.py]`. Nothing else should run on the machine. Figures are control
-steps per second; blocks of the measurements alternate and medians are reported, so that the ratios hold even where the
-machine's speed drifts. Beside them stand other environments on the CPU (see conf/benchmark.yaml). The last line of
-the output is one JSON object. `sim=gpu` measures MuJoCo Warp; hdmi gpu-report tabulates engines by number of
-worlds. A grid is a multirun: `-m task=walk,push_box num_envs=256,512 out=grid.jsonl compare.steps=0`.
+    hdmi benchmark [any option of hdmi train]
+
+Nothing else should run on the machine. Figures are control steps per second; blocks of the measurements alternate and
+medians are reported, so that the ratios hold even where the machine's speed drifts. Beside them stand other
+environments on the CPU (see conf/benchmark.yaml). The last line of the output is one JSON object. `sim=gpu` measures
+MuJoCo Warp; `hdmi gpu-report` tabulates engines by number of worlds. A grid is a multirun:
+`-m task=walk,push_box num_envs=256,512 out=grid.jsonl compare.steps=0`.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 from hdmi.assembly import Task, backend_of, make_env, make_transforms
 from hdmi.assets import Scene
 from hdmi.commands.comparison import mjlab_speed, mujoco_env_speed
+from hdmi.commands.script import run_composed
 from hdmi.config import CONF
 from hdmi.console import make_console
 from hdmi.envs import BatchBackend
@@ -193,7 +196,7 @@ def part_times(result: dict[str, Any]) -> Table:
 
 
 @hydra.main(config_path=str(CONF), config_name="benchmark", version_base="1.3")
-def main(cfg: DictConfig) -> None:
+def _composed(cfg: DictConfig) -> None:
     console = make_console()
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(cfg, Path(folder))
@@ -261,3 +264,8 @@ def main(cfg: DictConfig) -> None:
     if cfg.out is not None:
         with Path(cfg.out).open("a", encoding="utf-8") as file:
             file.write(line + "\n")
+
+
+def main() -> None:
+    """Measures under the config that the command line composes."""
+    run_composed(_composed)

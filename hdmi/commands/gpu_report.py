@@ -2,7 +2,7 @@
 
     hdmi gpu-report [engines=[cpu,gpu]] [worlds=[512,4096]] [out=report.jsonl] [overrides=[compile=true]]
 
-Each line of the table is hdmi benchmark in a process of its own, with `overrides` as for train.py; nothing else
+Each line of the table is `hdmi benchmark` in a process of its own, with `overrides` as for `hdmi train`; nothing else
 should run on the machine. A measurement that fails (no GPU, no memory) keeps its line, with the reason. `out` gets one
 JSON object per measurement.
 """

@@ -127,7 +127,7 @@ def plot_runs(runs: Sequence[Path], out: Path, window: int = 1) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Runs the script; returns its exit status."""
     plt.switch_backend("agg")
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser("hdmi plot", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folder, or a metrics.csv")
     parser.add_argument("--out", type=Path, default=Path("curves.png"), help="picture to write (default: %(default)s)")
     parser.add_argument("--smooth", type=int, default=1, metavar="ROWS", help="trailing mean over so many rows")

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
+from yaml import YAMLError
 
-from hdmi.config import ConfigError
+from hdmi.config import ConfigError, composition_fault, use_installed_configs
 from hdmi.console import make_console
 from hdmi.learning.checkpoint import CheckpointError
 from hdmi.learning.collectors import WorkerError
@@ -19,6 +23,7 @@ from hdmi.motion import MotionError
 USER_ERRORS = (
     ConfigError, MotionError, CheckpointError, DivergenceError, WorkerError, LoggerError, FileNotFoundError,
 )  # fmt: skip
+_FULL_ERROR = "HYDRA_FULL_ERROR"
 
 
 def run_script(
@@ -53,3 +58,27 @@ def run_script(
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+
+
+def run_composed(body: Callable[[], None]) -> None:
+    """Runs a function of `hydra.main`, with the configs of installed packages.
+
+    What a user can put right is one line and exit status 2; with HYDRA_FULL_ERROR=1 in the environment a traceback.
+    """
+    full = os.environ.get(_FULL_ERROR)
+    os.environ[_FULL_ERROR] = "1"  # Hydra raises then, instead of printing several lines and exiting with 1
+    try:
+        use_installed_configs()
+        body()
+    except (HydraException, OmegaConfBaseException, YAMLError, ImportError, *USER_ERRORS) as error:
+        if full == "1":
+            raise
+        own = isinstance(error, (ImportError, *USER_ERRORS))
+        fault = f"{type(error).__name__}: {error}" if own else f"ConfigError: {composition_fault(error)}"
+        print(fault, file=sys.stderr)
+        sys.exit(2)
+    finally:
+        if full is None:
+            del os.environ[_FULL_ERROR]
+        else:
+            os.environ[_FULL_ERROR] = full

@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from hdmi.assembly import describe, make_transforms
-from hdmi.commands.script import USER_ERRORS
-from hdmi.config import CONF, ConfigError, use_installed_configs
+from hdmi.commands.script import USER_ERRORS, run_composed
+from hdmi.config import CONF
 from hdmi.console import make_console
 from hdmi.envs.rendering import RenderingError
 from hdmi.evaluation import evaluate_checkpoint, render_checkpoint
@@ -151,9 +151,4 @@ def _composed(cfg: DictConfig) -> None:
 
 def main() -> None:
     """Trains under the config that the command line composes."""
-    try:
-        use_installed_configs()
-    except ConfigError as error:
-        print(f"ConfigError: {error}", file=sys.stderr)
-        sys.exit(2)
-    _composed()
+    run_composed(_composed)

@@ -21,7 +21,7 @@ def export(run_or_checkpoint: str | Path, folder: str | Path, num_envs: int = 25
 
     Args:
         run_or_checkpoint: a run folder (its newest checkpoint counts) or a checkpoint file.
-        folder: is made if it is not there; `scripts/play.py checkpoint=FOLDER` and `scripts/evaluate.py` take it.
+        folder: is made if it is not there; `hdmi play checkpoint=FOLDER` and `hdmi evaluate` take it.
 
     Raises:
         CheckpointError: if there is no usable checkpoint.
@@ -42,7 +42,7 @@ def export(run_or_checkpoint: str | Path, folder: str | Path, num_envs: int = 25
 def _card(state: dict, result: EvalResult, folder: Path, seed: int) -> str:
     """The text of README.md."""
     config = state["config"]
-    command = " ".join(["python train.py", *config.get("overrides", ())])
+    command = " ".join(["hdmi train", *config.get("overrides", ())])
     rows = [f"| {name} | {_shown(name, value['mean'])} |" for name, value in result.figures().items()]
     for name, share in result["termination_causes"].items():
         if share:
@@ -56,8 +56,8 @@ def _card(state: dict, result: EvalResult, folder: Path, seed: int) -> str:
         "",
         "```",
         command,
-        f"python scripts/evaluate.py checkpoint={folder} num_envs={result['num_envs']} seed={seed}",
-        f"python scripts/play.py checkpoint={folder}",
+        f"hdmi evaluate checkpoint={folder} num_envs={result['num_envs']} seed={seed}",
+        f"hdmi play checkpoint={folder}",
         "```",
         "",
         f"`policy.pt` holds the weights and the observations' normalization ({_megabytes(folder / POLICY_FILE)} MB); "

@@ -128,7 +128,7 @@ def load_checkpoint(path: str | Path, map_location: str | torch.device = "cpu") 
         raise CheckpointError(f"{file}: cannot be read: {error.strerror or error}") from error
     except Exception as error:  # a file of anything else: whatever reading it as a checkpoint leads to
         raise CheckpointError(
-            f"{file}: damaged or not a checkpoint; expected what train.py or scripts/export.py wrote, or its folder"
+            f"{file}: damaged or not a checkpoint; expected what hdmi train or hdmi export wrote, or its folder"
         ) from error
     found = state.get("format") if isinstance(state, dict) else None
     if isinstance(found, int) and found < FORMAT:

@@ -348,7 +348,7 @@ class Trainer:
                 self.collector.shutdown()
 
     def _config_of_run(self) -> DictConfig:
-        """The config without what only this call of `train.py` is about: a continued run is the uninterrupted one."""
+        """The config without what only this call of `hdmi train` is about: a continued run is the uninterrupted one."""
         cfg = self.cfg.copy()
         cfg.resume, cfg.resume_anyway = None, False
         return cfg

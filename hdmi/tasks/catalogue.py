@@ -32,7 +32,7 @@ def list_tasks(motion_root: str | None = None, config_dir: str | None = None) ->
 
     Tasks whose scene cannot be used are named below it.
     """
-    table = Table(title="Tasks: python train.py task=NAME", title_justify="left")
+    table = Table(title="Tasks: hdmi train task=NAME", title_justify="left")
     for column in ("task", "object", "scenery", "effectors", "robot", "frames", "contact", "sources"):
         table.add_column(column, justify="right" if column == "frames" else "left")
     unusable: list[str] = []
