@@ -328,7 +328,7 @@ class TestCheck:
 
     def test_trains(self, only_training):
         with patch.multiple("hdmi.tasks.check", _RETURN_ENVS=4, _RETURN_STEPS=4):
-            training = check_task("lift_box", frames=256, num_envs=4, num_threads=1).training
+            training = check_task("lift_box", frames=64, num_envs=4, num_threads=1).training
         assert training.before.shape == training.after.shape == (4,)
         assert not np.array_equal(training.before, training.after)
 
