@@ -73,6 +73,32 @@ def test_the_laptop_preset_is_what_lift_box_has():
         assert name not in strict or node == embedded.termination[name]
 
 
+def test_rows_of_the_tables_that_are_config_alone():
+    """Kernels bound to keys, with parameters: the table at the start names them."""
+    cfg = load_config(
+        "+reward.near={_target_: hdmi.transforms.KernelReward, function: hdmi.functional.tracking, "
+        "keys: [[error, root_pos]], weight: 2.0, sigma: 0.5}",
+        "+termination.far={_target_: hdmi.transforms.KernelTermination, function: hdmi.functional.error_exceeds, "
+        "keys: [[error, root_pos]], threshold: 0.0, min_steps: 1}",
+    )
+    table = describe(make_transforms(cfg, lift_box()))
+    rows = dict(zip(table.columns[0].cells, zip(*(c.cells for c in table.columns[1:]), strict=True), strict=True))
+    assert rows["reward.near"] == ("KernelReward: tracking", "error/root_pos", "reward_terms/near", "2")
+    assert rows["termination.far"][0] == "KernelTermination: error_exceeds"
+    env = make_env(cfg, 2, lift_box())
+    step = env.rollout(1)["next"]
+    assert (step["reward_terms", "near"] > 0).all()
+    assert step["termination", "far"].all()  # no robot is where its reference is to the bit
+    with pytest.raises(ConfigError, match=r"reward\.near.*does not take 1 keys and \['width'\]"):
+        make_transforms(
+            load_config(
+                "+reward.near={_target_: hdmi.transforms.KernelReward, function: hdmi.functional.tracking, "
+                "keys: [[error, root_pos]], width: 0.5}"
+            ),
+            lift_box(),
+        )
+
+
 class TestAblations:
     def test_all_are_expected(self):
         assert set(ABLATIONS) == set(EXPECTED)
