@@ -16,10 +16,10 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import NestedKey
 from torch import Tensor, nn
 
-from hdmi import __version__
+import hdmi
 from hdmi.assembly import Task, make_env, make_task, make_transforms
-from hdmi.deploy.format import FORMAT, GRAPH_FILE, SCENE_FILE, SENSORS
-from hdmi.deploy.graph import UNMEASURED, DeploymentError, Measured, PolicyGraph, name_of
+from hdmi.deploy.format import FORMAT, GRAPH_FILE, SCENE_FILE, SENSORS, DeploymentError
+from hdmi.deploy.graph import UNMEASURED, Measured, PolicyGraph, name_of
 from hdmi.learning.checkpoint import find_checkpoint, load_checkpoint
 from hdmi.learning.policy import make_networks
 
@@ -162,7 +162,7 @@ def metadata_of(cfg: DictConfig, graph: PolicyGraph, task: Task) -> dict[str, st
     inputs = {name: {"shape": list(shape)} | SENSORS[name] for name, shape in graph.measured.sensors.items()}
     return {
         "format": FORMAT,
-        "hdmi_version": __version__,
+        "hdmi_version": hdmi.__version__,
         "robot": robot.name,
         "task": task.name,
         "motion": reference.name,

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+
+class DeploymentError(ValueError):
+    """A policy that cannot leave the trainer, or cannot be run; the message names what is wrong with it."""
+
+
 FORMAT = "hdmi-policy/1"
 GRAPH_FILE = "policy.onnx"
 SCENE_FILE = "scene.xml"

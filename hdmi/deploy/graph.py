@@ -23,10 +23,6 @@ FRESH = "fresh"  # state that is 1 in the first tick of an episode
 UNMEASURED = "unmeasured"  # of entries that no sensor gives
 
 
-class DeploymentError(ValueError):
-    """A policy that cannot leave the trainer; the message says for which term or transform."""
-
-
 def name_of(key: NestedKey) -> str:
     """`("a", "b")` as it is called in a graph: `a.b`."""
     return key if isinstance(key, str) else ".".join(key)
