@@ -15,7 +15,8 @@ from torch import Tensor
 from hdmi.assembly import Task, make_env, make_task
 from hdmi.config import task_files
 from hdmi.deploy.export import make_graph, metadata_of, to_onnx
-from hdmi.deploy.graph import DeploymentError, PolicyGraph, name_of
+from hdmi.deploy.format import DeploymentError
+from hdmi.deploy.graph import PolicyGraph, name_of
 from hdmi.envs import RowResetEnv
 from hdmi.functional import quat_apply_inverse
 from hdmi.learning.networks import make_actor, network_of

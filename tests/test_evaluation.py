@@ -386,7 +386,9 @@ def test_an_exported_policy_acts_like_its_checkpoint(
     monkeypatch.setattr(video, "every", lambda moments, stride: short(moments, 3))
     out = tmp_path / "zoo" / "lift_box"
     assert command("export").main([f"checkpoint={run}", f"out={out}", "num_envs=2"]) == 0
-    assert {path.name for path in out.iterdir()} == {"policy.pt", "config.yaml", "eval.json", "video.mp4", "README.md"}
+    assert {path.name for path in out.iterdir()} == {
+        "policy.pt", "policy.onnx", "scene.xml", "config.yaml", "eval.json", "video.mp4", "README.md",
+    }  # fmt: skip
     original, exported = (load_policy(path)[0] for path in (run, out))
     assert original.state_dict().keys() == exported.state_dict().keys()
     for name, value in original.state_dict().items():
@@ -400,6 +402,7 @@ def test_an_exported_policy_acts_like_its_checkpoint(
     card = (out / "README.md").read_text()
     assert card == capsys.readouterr().out[:-1]
     assert "after 96 frames, 2 minutes" in card
+    assert "policy.onnx" in card
     assert f"| survival | {100 * figures['survival']['mean']:.1f} % |" in card
 
 

@@ -17,6 +17,7 @@ from rich.console import Console
 from hdmi.commands.options import parse_options
 from hdmi.commands.script import run_script
 from hdmi.config import ConfigError
+from hdmi.deploy.format import DeploymentError
 from hdmi.envs.rendering import RenderingError
 from hdmi.evaluation.card import export
 
@@ -49,4 +50,4 @@ def write(arguments: list[str], console: Console) -> int:
 
 def main(arguments: list[str]) -> int:
     """Runs the script; returns its exit status."""
-    return run_script(write, arguments, __doc__, errors=(RenderingError,))
+    return run_script(write, arguments, __doc__, errors=(RenderingError, DeploymentError))

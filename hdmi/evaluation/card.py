@@ -8,6 +8,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
+from hdmi.deploy.format import GRAPH_FILE, SCENE_FILE
 from hdmi.evaluation.protocol import EvalResult, evaluate_checkpoint, unit_of
 from hdmi.evaluation.video import render_checkpoint
 from hdmi.learning import export_policy, load_checkpoint
@@ -60,6 +61,7 @@ def _card(state: dict, result: EvalResult, folder: Path, seed: int) -> str:
         f"hdmi play checkpoint={folder}",
         "```",
         "",
+        *_graph_lines(folder),
         f"`policy.pt` holds the weights and the observations' normalization ({_megabytes(folder / POLICY_FILE)} MB); "
         "`config.yaml` is the whole config of the training, `eval.json` the evaluation from the first frame, under the "
         "training's reset noise and randomization:",
@@ -69,6 +71,18 @@ def _card(state: dict, result: EvalResult, folder: Path, seed: int) -> str:
         *rows,
     ]
     return "\n".join(lines) + "\n"
+
+
+def _graph_lines(folder: Path) -> list[str]:
+    """What the card says of the deployment graph, if there is one."""
+    if not (folder / GRAPH_FILE).is_file():
+        return []
+    size = _megabytes(folder / GRAPH_FILE)
+    return [
+        f"`{GRAPH_FILE}` is the policy with its observations and actions as one graph, from sensors to joint position "
+        f"targets ({size} MB); `{SCENE_FILE}` is the scene that it was trained in.",
+        "",
+    ]
 
 
 def _shown(name: str, value: float) -> str:
