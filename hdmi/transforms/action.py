@@ -198,6 +198,8 @@ class ActionSmoothing(ActionStateTransform):
         tensor(0.3000)
     """
 
+    training_only = True
+
     def __init__(
         self,
         alpha: Sequence[float] = (0.8, 1.0),
@@ -263,6 +265,8 @@ class ActionDelay(ActionStateTransform):
         >>> td["robot", "joint_target"][0, 0]
         tensor(0.2000)
     """
+
+    training_only = True
 
     def __init__(
         self,

@@ -64,7 +64,12 @@ class SpecTransform(Transform):
 
     TorchRL's Transform clones all specs, tensors of the batch's size included, for each transform, so that a stack of
     n transforms over m keys takes n m tensors to build; here only the structure is copied.
+
+    Attributes:
+        training_only: whether a policy that has left the trainer does without it: noise, delays, randomization.
     """
+
+    training_only = False
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         output_spec = copied(output_spec)

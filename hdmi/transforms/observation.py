@@ -202,6 +202,8 @@ class UniformNoise(FunctionTransform):
         (True, True)
     """
 
+    training_only = True
+
     def __init__(self, key: NestedKey, scale: float | Sequence[float]):
         super().__init__([key], [key])
         self.register_buffer("scale", torch.as_tensor(scale, dtype=torch.float32), persistent=False)
@@ -284,6 +286,8 @@ class EpisodeNoise(_EntryState):
         (torch.Size([2, 3, 29]), True, True)
     """
 
+    training_only = True
+
     def __init__(self, key: NestedKey, scale: float, state_key: NestedKey | None = None):
         super().__init__(key, below("episode_noise", key_of(key)) if state_key is None else state_key)
         self.scale = scale
@@ -307,6 +311,8 @@ class HeadingNoise(FunctionTransform):
         >>> turned[:, :3], bool(turned[0, 4].abs() < 0.1)  # the sine of the angle
         (tensor([[2., 0., 0.]]), True)
     """
+
+    training_only = True
 
     def __init__(self, key: NestedKey, scale: float):
         super().__init__([key], [key])

@@ -39,6 +39,8 @@ class ModelRandomization(SpecTransform):
         worlds_key: numbers of the worlds that reset, int64 [n], where only rows do.
     """
 
+    training_only = True
+
     def __init__(
         self,
         per: Literal["episode", "world"] = "episode",
@@ -338,6 +340,8 @@ class JointOffset(ActionStateTransform):
         (True, True)
     """
 
+    training_only = True
+
     def __init__(
         self,
         offset: float,
@@ -385,6 +389,8 @@ class RandomPush(StateTransform):
         >>> env.rollout(4)["push_countdown", "push"][0].flatten()  # a step that begins at 1 pushes
         tensor([2, 1, 2, 1])
     """
+
+    training_only = True
 
     def __init__(
         self,

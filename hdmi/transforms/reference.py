@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import copy
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -77,8 +78,8 @@ class MotionReference(StateTransform):
         bodies = match_names(tracked_bodies, body_names, "tracked_bodies")
         tables = _reference_table(reference, bodies, joints, future_steps)
         table = {below(out_key, key): value for key, value in tables.items()}
-        self._step_key, self._base_key = below(out_key, "step"), below(out_key, "joint_pos")
-        super().__init__(in_keys=[], out_keys=[self._step_key, *table])
+        self.step_key, self._base_key = below(out_key, "step"), below(out_key, "joint_pos")
+        super().__init__(in_keys=[], out_keys=[self.step_key, *table])
         self.frame_key = key_of(frame_key)
         self.num_frames = reference.num_frames
         self._shapes = {key: value.shape[1:] for key, value in table.items()}
@@ -87,10 +88,19 @@ class MotionReference(StateTransform):
         flat = torch.cat([value.reshape(reference.num_frames, -1).float() for value in table.values()], dim=-1)
         self.register_buffer("table", flat, persistent=False)
 
+    def restricted(self, keys: Collection[NestedKey]) -> MotionReference:
+        """The same clock, which writes only these of its keys."""
+        out = copy.copy(self)
+        out._shapes = {key: shape for key, shape in self._shapes.items() if key in keys}
+        out.out_keys = [self.step_key, *out._shapes]
+        parts = dict(zip(self._shapes, self.table.split([s.numel() for s in self._shapes.values()], -1), strict=True))
+        out._buffers = {"table": torch.cat([parts[key] for key in out._shapes], dim=-1)}
+        return out
+
     def _lookup(self, step: Tensor) -> dict[NestedKey, Tensor]:
         rows = self.table[step.reshape(-1)].reshape(*step.shape[:-1], -1)
         sizes = [shape.numel() for shape in self._shapes.values()]
-        out: dict[NestedKey, Tensor] = {self._step_key: step}
+        out: dict[NestedKey, Tensor] = {self.step_key: step}
         for (key, shape), value in zip(self._shapes.items(), rows.split(sizes, dim=-1), strict=True):
             out[key] = value.unflatten(-1, shape).to(self._dtypes[key])
         return out
@@ -102,7 +112,7 @@ class MotionReference(StateTransform):
         input_spec = copied(input_spec)
         # only the clock is read back by this transform, and the joint positions by residual actions
         state = self.initial_state(input_spec.shape, input_spec.device)
-        return add_state_specs(input_spec, {key: spec_like(state[key]) for key in (self._step_key, self._base_key)})
+        return add_state_specs(input_spec, {key: spec_like(state[key]) for key in (self.step_key, self._base_key)})
 
     def _write(self, tensordict: TensorDictBase, step: Tensor) -> TensorDictBase:
         for key, value in self._lookup(step).items():
@@ -116,7 +126,7 @@ class MotionReference(StateTransform):
         return self._write(tensordict_reset, step)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        step = (tensordict.get(self._step_key) + 1).clamp(max=self.num_frames - 1)
+        step = (tensordict.get(self.step_key) + 1).clamp(max=self.num_frames - 1)
         return self._write(next_tensordict, step)
 
 
