@@ -17,7 +17,7 @@ from torchrl.envs import Transform
 from hdmi.functional import quat_apply, quat_from_axis_angle, quat_multiply
 from hdmi.learning.networks import network_of
 from hdmi.transforms import MotionReference
-from hdmi.transforms.common import StateTransform, below, key_of
+from hdmi.transforms.common import StateTransform
 
 FRESH = "fresh"  # state that is 1 in the first tick of an episode
 UNMEASURED = "unmeasured"  # of entries that no sensor gives
@@ -113,7 +113,7 @@ class Measured(nn.Module):
             link_pos, link_quat = pos, quat
             if self.has_hinge:
                 found["object", "joint_pos"] = sensors["object_joint_pos"]
-                turn = quat_from_axis_angle(self.hinge_axis * sensors["object_joint_pos"])
+                turn = quat_from_axis_angle(self.hinge_axis, sensors["object_joint_pos"][0])
                 link_pos = pos + quat_apply(quat, self.hinge_pos)
                 link_quat = quat_multiply(quat_multiply(quat, self.hinge_quat), turn)
             found |= {
@@ -177,7 +177,7 @@ class PolicyGraph(nn.Module):
             before: None in the first tick.
             fresh: bool [1, 1], whether this is the first tick, if that is only known when the graph runs.
         """
-        for name, transform in self.stages:
+        for _, transform in self.stages:
             if not isinstance(transform, StateTransform) and not hasattr(transform, "fresh_state"):
                 now = transform._call(now) if hasattr(transform, "_call") else transform(now)
                 continue

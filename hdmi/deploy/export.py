@@ -1,0 +1,200 @@
+"""A policy's deployment graph as a file: ONNX, with everything that a runner has to know in its metadata."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import onnx
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import NestedKey
+from torch import Tensor, nn
+
+from hdmi import __version__
+from hdmi.assembly import Task, make_env, make_task, make_transforms
+from hdmi.deploy.format import FORMAT, GRAPH_FILE, SCENE_FILE, SENSORS
+from hdmi.deploy.graph import UNMEASURED, DeploymentError, Measured, PolicyGraph, name_of
+from hdmi.learning.checkpoint import find_checkpoint, load_checkpoint
+from hdmi.learning.policy import make_networks
+
+OPSET = 20
+
+
+def make_graph(cfg: DictConfig, actor: nn.Module, task: Task | None = None) -> tuple[PolicyGraph, Task]:
+    """The deployment graph of a policy, from the transform stack of its config.
+
+    Args:
+        actor: in float32, whatever it was trained in.
+        task: made from the config if absent.
+
+    Raises:
+        ConfigError, MotionError: for a config or a motion that cannot be used.
+    """
+    task = make_task(cfg) if task is None else task
+    env = make_env(cfg, 1, task)
+    spec = env.base_env.full_observation_spec
+    entries: dict[NestedKey, torch.Size] = {key: spec[key].shape[1:] for key in spec.keys(True, True)}
+    names = [name for name, _ in make_transforms(cfg, task)]
+    # bound to their environment, whose action they know the width of; what selects outputs stands behind them
+    stack = list(zip(names, env.transform.transforms, strict=False))
+    return PolicyGraph(stack, actor, Measured(entries, _hinge(task))), task
+
+
+def _hinge(task: Task) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Pose of the object's link in the object, and the axis that it turns about."""
+    scene = task.scene
+    if scene.object_hinge_qpos is None or scene.object_link is None:
+        return None
+    model, link = scene.model, scene.object_link
+    axis = model.jnt_axis[model.body_jntadr[link]]
+    pos, quat, axis = (
+        torch.tensor(v, dtype=torch.float32) for v in (model.body_pos[link], model.body_quat[link], axis)
+    )
+    return pos, quat, axis
+
+
+def to_onnx(graph: PolicyGraph) -> onnx.ModelProto:
+    """Traces a graph, and leaves away what its results do not depend on.
+
+    Raises:
+        DeploymentError: if they depend on what no sensor gives; names the observation terms.
+    """
+    inputs = graph.inputs
+    noisy = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
+    levels = [logger.level for logger in noisy]
+    for logger in noisy:
+        logger.setLevel(logging.ERROR)
+    try:
+        with torch.no_grad(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            program = torch.onnx.export(
+                graph.eval(), tuple(inputs.values()), input_names=list(inputs), output_names=graph.outputs,
+                opset_version=OPSET, dynamo=True, external_data=False, verbose=False,
+            )  # fmt: skip
+    finally:
+        for logger, level in zip(noisy, levels, strict=True):
+            logger.setLevel(level)
+    assert program is not None
+    model = program.model_proto
+    used = _reached(model)
+    for key in graph.others:
+        if f"{UNMEASURED}.{name_of(key)}" in used:
+            terms = ", ".join(graph.terms_that_read(key)) or "the action"
+            raise DeploymentError(
+                f"{terms}: depends on {name_of(key)!r}, which no robot measures; sensors are "
+                f"{', '.join(graph.measured.sensors)}"
+            )
+    kept = [value for value in model.graph.input if value.name in used]
+    del model.graph.input[:]
+    model.graph.input.extend(kept)
+    return model
+
+
+def _reached(model: onnx.ModelProto) -> set[str]:
+    """Names of all values that the outputs depend on."""
+    makers = {name: node for node in model.graph.node for name in node.output}
+    found: set[str] = set()
+    waiting = [value.name for value in model.graph.output]
+    while waiting:
+        if (name := waiting.pop()) not in found:
+            found.add(name)
+            waiting += makers[name].input if name in makers else ()
+    return found
+
+
+def export_graph(checkpoint: str | Path, folder: str | Path) -> Path:
+    """Writes `policy.onnx` and `scene.xml`, the scene as self-contained MJCF, into a folder.
+
+    Args:
+        checkpoint: a run folder (its newest checkpoint counts), an exported policy, or a checkpoint file.
+        folder: is made if it is not there.
+
+    Raises:
+        CheckpointError: if there is no usable checkpoint.
+        ConfigError, MotionError: if its environment cannot be built here.
+        DeploymentError: if the policy needs what no robot measures.
+        OSError: if a file cannot be written.
+    """
+    state = load_checkpoint(find_checkpoint(checkpoint))
+    cfg = OmegaConf.create(state["config"])
+    assert isinstance(cfg, DictConfig)
+    cfg.algo.bf16 = False
+    cfg.num_threads = 1
+    actor, _ = make_networks(cfg, state["sizes"], torch.device("cpu"))
+    actor.load_state_dict(state["actor"])
+    graph, task = make_graph(cfg, actor)
+    model = to_onnx(graph)
+    digest = hashlib.sha256(json.dumps(state["config"], sort_keys=True).encode()).hexdigest()
+    metadata = metadata_of(cfg, graph, task) | {"config_hash": digest, "training_frames": str(state["frames"])}
+    onnx.helper.set_model_props(model, metadata)
+    onnx.checker.check_model(model)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / GRAPH_FILE).write_bytes(model.SerializeToString())
+    (folder / SCENE_FILE).write_text(task.scene.xml, encoding="utf-8")
+    return folder / GRAPH_FILE
+
+
+def metadata_of(cfg: DictConfig, graph: PolicyGraph, task: Task) -> dict[str, str]:
+    """What a runner has to know, by name: lists with commas between, mappings as JSON; SI units.
+
+    The names that others' policies have, too, mean the same: `joint_names`, `joint_stiffness`, `joint_damping`,
+    `default_joint_pos`, `action_scale`, `observation_names`, `body_names`, `anchor_body_name`.
+    """
+    robot, reference = task.scene.robot, task.reference
+    scale = torch.zeros(len(robot.joint_names))
+    for _, transform in graph.inverse:
+        if hasattr(transform, "scale"):
+            scale[transform.index] = transform.scale
+    start: dict[str, Any] = {
+        "joint_pos": reference.joint_pos[0],
+        "root_pos_w": reference.body_pos[0, 0],
+        "root_quat_w": reference.body_quat[0, 0],
+    }
+    if reference.has_object:
+        start |= {"object_pos_w": reference.object_pos[0], "object_quat_w": reference.object_quat[0]}
+        if "object_joint_pos" in graph.measured.sensors:
+            start["object_joint_pos"] = reference.object_joint_pos[0]
+    inputs = {name: {"shape": list(shape)} | SENSORS[name] for name, shape in graph.measured.sensors.items()}
+    return {
+        "format": FORMAT,
+        "hdmi_version": __version__,
+        "robot": robot.name,
+        "task": task.name,
+        "motion": reference.name,
+        "num_frames": str(reference.num_frames),
+        "control_dt": str(task.scene.sim.control_dt),
+        "joint_names": ",".join(robot.joint_names),
+        "joint_stiffness": _numbers(robot.stiffness),
+        "joint_damping": _numbers(robot.damping),
+        "default_joint_pos": _numbers(robot.default_joint_pos),
+        "action_scale": _numbers(scale.tolist()),
+        "observation_names": ",".join(
+            name.rpartition(".")[2] for name, _ in graph.stages if name.startswith("observation.policy.")
+        ),
+        "body_names": ",".join(robot.body_names),
+        "anchor_body_name": robot.root,
+        "effort_limits": _numbers(robot.effort_limits),
+        "velocity_limits": _numbers(robot.velocity_limits),
+        "joint_ranges": json.dumps([list(pair) for pair in robot.joint_ranges]),
+        "armature": _numbers(robot.armature),
+        "sensors": json.dumps(inputs),
+        "state": json.dumps({name.removeprefix("state."): value.tolist() for name, value in _state(graph).items()}),
+        "start": json.dumps({name: value.tolist() for name, value in start.items()}),
+        "quaternions": "wxyz",
+    }
+
+
+def _state(graph: PolicyGraph) -> Mapping[str, Tensor]:
+    """State before the first tick, by the name of its input."""
+    return {name: value for name, value in graph.inputs.items() if name.startswith("state.")}
+
+
+def _numbers(values: Any) -> str:
+    return ",".join(repr(float(value)) for value in values)

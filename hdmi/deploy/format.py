@@ -1,0 +1,20 @@
+"""What an exported policy consists of: names of its files, sensors with their units and frames. No torch in here."""
+
+from __future__ import annotations
+
+FORMAT = "hdmi-policy/1"
+GRAPH_FILE = "policy.onnx"
+SCENE_FILE = "scene.xml"
+TARGET = "joint_pos_target"  # rad, [J]
+
+# World frame, quaternions wxyz, SI units.
+SENSORS: dict[str, dict[str, str]] = {
+    "joint_pos": {"unit": "rad", "frame": "joint", "source": "encoders"},
+    "joint_vel": {"unit": "rad/s", "frame": "joint", "source": "encoders"},
+    "root_quat_w": {"unit": "1", "frame": "world", "source": "IMU, its heading from motion capture"},
+    "root_ang_vel_b": {"unit": "rad/s", "frame": "root", "source": "IMU"},
+    "root_pos_w": {"unit": "m", "frame": "world", "source": "motion capture"},
+    "object_pos_w": {"unit": "m", "frame": "world", "source": "motion capture"},
+    "object_quat_w": {"unit": "1", "frame": "world", "source": "motion capture"},
+    "object_joint_pos": {"unit": "rad", "frame": "joint", "source": "motion capture"},
+}
