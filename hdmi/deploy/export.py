@@ -46,17 +46,15 @@ def make_graph(cfg: DictConfig, actor: nn.Module, task: Task | None = None) -> t
     return PolicyGraph(stack, actor, Measured(entries, _hinge(task))), task
 
 
-def _hinge(task: Task) -> tuple[Tensor, Tensor, Tensor] | None:
+def _hinge(task: Task) -> tuple[Tensor, ...] | None:
     """Pose of the object's link in the object, and the axis that it turns about."""
     scene = task.scene
     if scene.object_hinge_qpos is None or scene.object_link is None:
         return None
     model, link = scene.model, scene.object_link
     axis = model.jnt_axis[model.body_jntadr[link]]
-    pos, quat, axis = (
-        torch.tensor(v, dtype=torch.float32) for v in (model.body_pos[link], model.body_quat[link], axis)
-    )
-    return pos, quat, axis
+    pos, quat = model.body_pos[link], model.body_quat[link]
+    return tuple(torch.tensor(value, dtype=torch.float32) for value in (pos, quat, axis))
 
 
 def to_onnx(graph: PolicyGraph) -> onnx.ModelProto:
