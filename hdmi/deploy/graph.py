@@ -82,9 +82,12 @@ class Measured(nn.Module):
         hinge: pose of the object's link in the object and the axis that it turns about, if it has one.
     """
 
-    def __init__(self, entries: Mapping[NestedKey, torch.Size], hinge: tuple[Tensor, Tensor, Tensor] | None):
+    def __init__(self, entries: Mapping[NestedKey, torch.Size], hinge: tuple[Tensor, ...] | None):
         super().__init__()
         self.entries = dict(entries)
+        self.hinge_pos: Tensor
+        self.hinge_quat: Tensor
+        self.hinge_axis: Tensor
         for name, value in zip(("pos", "quat", "axis"), hinge or (), strict=False):
             self.register_buffer(f"hinge_{name}", value, persistent=False)
         self.has_hinge = hinge is not None
@@ -160,7 +163,6 @@ class PolicyGraph(nn.Module):
         used |= {unravel_key(key) for _, t in inverse for key in getattr(t, "state_keys", ())}
         self.stages = [(n, t.restricted(used) if isinstance(t, MotionReference) else t) for n, t in forward]
         self.inverse = inverse
-        self.clock = next((t for _, t in self.stages if isinstance(t, MotionReference)), None)
         sensors = {name: torch.zeros(shape) for name, shape in measured.sensors.items()}
         others = {key: torch.zeros(measured.entries[key]) for key in self.others}
         first = self._tick(measured(sensors, others), None)
@@ -184,7 +186,7 @@ class PolicyGraph(nn.Module):
             versions = []
             if before is None or fresh is not None:
                 start = TensorDict({}, batch_size=[1])
-                if transform is self.clock and before is not None:
+                if isinstance(transform, MotionReference) and before is not None:
                     start.set(transform.frame_key, before.get(transform.step_key))
                 versions.append(transform._reset(start, now.copy()))
             if before is not None:
