@@ -238,7 +238,7 @@ class Runner:
             self._enter(State.HOLD)
 
     def _joints(self, sensors: object) -> dict[str, np.ndarray]:
-        """Positions and velocities of the policy's joints between ticks; the last good ones where they are not finite."""
+        """Positions and velocities of the policy's joints between ticks; the last ones where they are not finite."""
         found = {}
         for name in ("joint_pos", "joint_vel"):
             value = np.asarray(sensors[name])[self._index] if name in sensors else np.array(np.nan)  # type: ignore

@@ -14,6 +14,11 @@ from hdmi.deploy.robots.mujoco import MujocoRobot
 from hdmi.deploy.rotations import quat_angle, quat_apply_inverse, quat_conjugate, quat_multiply, tilt_of, yaw_of
 
 FALL_TILT = 1.0  # rad of the root's tilt beyond the motion's
+UNITS = {
+    "success_rate": "%", "survival": "%", "joint_pos_error": "rad", "body_pos_error": "m", "body_ori_error": "rad",
+    "root_pos_error": "m", "root_ori_error": "rad", "object_pos_error": "m", "object_ori_error": "rad",
+    "object_joint_error": "rad", "ms_mean": "ms", "ms_p99": "ms",
+}  # fmt: skip
 FALL_HEIGHT = 0.5  # m of the root off the motion's height
 
 

@@ -1,7 +1,7 @@
 """A robot in MuJoCo, apart from the trainer: its own model, step, integrator and servos, and ways to disturb it.
 
-The scene is the policy's `scene.xml`, stepped at 2 ms with the implicit integrator instead of the training's. Servos are
-what motor drivers are: torque = stiffness (target - q), clipped to the effort limits, and damping, which is integrated
+The scene is the policy's `scene.xml`, stepped at 2 ms with the implicit integrator instead of the training's. Servos
+are what motor drivers are: torque = stiffness (target - q), clipped to the effort limits, and damping, integrated
 implicitly as the joint's. The clock is the simulation's, so that runs are as fast as the machine.
 """
 
