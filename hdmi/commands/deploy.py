@@ -1,7 +1,7 @@
 """Runs an exported policy on a robot, real or simulated, without the trainer: needs neither torch nor hydra.
 
     hdmi deploy policy=FOLDER robot=mujoco [episodes=50] [log=FILE.npz] [plot=FILE.png] ...
-    hdmi deploy policy=FOLDER robot=NAME auto=false log=FILE.npz      # keys: s to the start, r run, h hold, space damping
+    hdmi deploy policy=FOLDER robot=NAME auto=false log=FILE.npz  # keys: s to the start, r run, h hold, space damping
     hdmi deploy policy=FOLDER replay=FILE.npz [plot=FILE.png]         # the graph over logged sensors
 
 With `episodes`, a simulated robot begins each episode at the perturbed first frame, and a table shows success, errors
@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, make_dataclass
+from dataclasses import dataclass, fields, make_dataclass, replace
 from importlib import import_module
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 from rich.console import Console
@@ -61,16 +61,14 @@ def _parse(arguments: Sequence[str]) -> tuple[Options, dict[type, Any], Any]:
     chosen = [argument.partition("=")[2] for argument in arguments if argument.startswith("robot=")]
     module = _module(chosen[-1]) if chosen else None
     parts = [Options, runner.Options, safety.Limits] + ([] if module is None else [module.Options])
-    everything = parse_options(_merged(parts), arguments)
+    everything: Any = parse_options(_merged(parts), arguments)
     values = {part: part(**{f.name: getattr(everything, f.name) for f in fields(part)}) for part in parts}
     return values[Options], values, module
 
 
 def _merged(parts: Sequence[type]) -> type:
     """One dataclass of all options; what two parts call the same is the same."""
-    from typing import get_type_hints
-
-    found = {}
+    found: dict[str, tuple[str, Any, Any]] = {}
     for part in parts:
         hints = get_type_hints(part)
         found |= {f.name: (f.name, hints[f.name], f) for f in fields(part)}
@@ -121,8 +119,6 @@ def _drive(options: Options, values: dict[type, Any], policy: Policy, robot: Any
 
 def _episodes(options: Options, values: dict[type, Any], policy: Policy, robot: Any, console: Console) -> int:
     """Episodes of a simulated robot, and their figures; log and plot are of the last."""
-    from dataclasses import replace
-
     from hdmi.deploy.robots.mujoco import MujocoRobot
     from hdmi.deploy.trial import Judge, Result, read_reference
 
@@ -155,7 +151,7 @@ def results_table(results: list[Any], policy: Policy) -> Table:
     table.add_column("figure")
     table.add_column("mean", justify="right")
     table.add_column("unit")
-    for name, value in summarize(results).items():
+    for name, value in summarize(results, description.num_frames).items():
         unit = UNITS[name]
         table.add_row(name, f"{value * 100:.1f}" if unit == "%" else f"{value:.3g}", unit)
     table.add_section()

@@ -102,9 +102,9 @@ class Gamepad:
 class Interrupts:
     """Signals that ask for the end, while a robot is driven: Ctrl-C, termination, a terminal that is gone.
 
-    The first one only sets `asked`, so that no tick is cut in two; a second one raises `KeyboardInterrupt`, in case the
-    loop does not come round any more. After `shield` they are ignored until the context ends. Elsewhere than in the
-    main thread, which alone gets signals, this does nothing.
+    The first one only sets `asked`, so that no tick is cut in two; the second one raises `KeyboardInterrupt`, in case
+    the loop does not come round any more; from the third on, or from `shield` on, they are ignored until the context
+    ends. Elsewhere than in the main thread, which alone gets signals, this does nothing.
     """
 
     _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
@@ -123,7 +123,7 @@ class Interrupts:
     def _note(self, number: int, frame: FrameType | None) -> None:
         del number, frame
         self.asked += 1
-        if self.asked > 1 and not self._shielded:
+        if self.asked == 2 and not self._shielded:
             raise KeyboardInterrupt
 
     def shield(self, actions: Iterable[Callable[[], object]]) -> list[BaseException]:

@@ -45,6 +45,7 @@ class Description:
         start: the first frame: `joint_pos`, `root_pos_w`, `root_quat_w`, with an object `object_pos_w`,
             `object_quat_w`, `object_joint_pos`; velocities `joint_vel`, `root_lin_vel_w`, `root_ang_vel_w`.
         start_noise: half ranges of the perturbations that training starts the first frame with.
+        object_joint: ranges of `friction` (N m, dry) and `damping` (N m s/rad) of the object's joint in training.
         tracked_joints, tracked_bodies: what the errors of an evaluation are of.
         terminations: what an evaluation counts as failures, as far as it can be told from poses.
         unchecked: names of those that cannot.
@@ -66,6 +67,7 @@ class Description:
     sensors: Mapping[str, tuple[int, ...]]
     start: Mapping[str, np.ndarray]
     start_noise: Mapping[str, Any] = field(default_factory=dict)
+    object_joint: Mapping[str, np.ndarray] = field(default_factory=dict)
     tracked_joints: tuple[str, ...] = ()
     tracked_bodies: tuple[str, ...] = ()
     terminations: Mapping[str, Termination] = field(default_factory=dict)
@@ -149,6 +151,7 @@ def read_description(metadata: Mapping[str, str], where: str) -> Description:
         sensors=sensors,
         start=start,
         start_noise=entry("start_noise", arrays, {}),
+        object_joint=entry("object_joint", arrays, {}),
         tracked_joints=entry("tracked_joints", _names, names),
         tracked_bodies=entry("tracked_bodies", _names, ()),
         terminations=entry("terminations", _terminations, {}),

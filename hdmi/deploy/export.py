@@ -132,16 +132,27 @@ def export_graph(checkpoint: str | Path, folder: str | Path) -> Path:
     actor, _ = make_networks(cfg, state["sizes"], torch.device("cpu"))
     actor.load_state_dict(state["actor"])
     graph, task = make_graph(cfg, actor)
-    model = to_onnx(graph)
     digest = hashlib.sha256(json.dumps(state["config"], sort_keys=True).encode()).hexdigest()
-    metadata = metadata_of(cfg, graph, task) | {"config_hash": digest, "training_frames": str(state["frames"])}
-    onnx.helper.set_model_props(model, metadata)
+    return write_graph(cfg, graph, task, folder, {"config_hash": digest, "training_frames": str(state["frames"])})
+
+
+def write_graph(
+    cfg: DictConfig, graph: PolicyGraph, task: Task, folder: str | Path, more: Mapping[str, str] | None = None
+) -> Path:
+    """Writes what `export_graph` says, of a graph; `more` is metadata besides `metadata_of`.
+
+    Raises:
+        DeploymentError: if the policy needs what no robot measures.
+        OSError: if a file cannot be written.
+    """
+    model = to_onnx(graph)
+    onnx.helper.set_model_props(model, metadata_of(cfg, graph, task) | dict(more or {}))
     onnx.checker.check_model(model)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / GRAPH_FILE).write_bytes(model.SerializeToString())
     (folder / SCENE_FILE).write_text(task.scene.xml, encoding="utf-8")
-    np.savez_compressed(folder / REFERENCE_FILE, **reference_arrays(task.reference))
+    np.savez_compressed(folder / REFERENCE_FILE, **reference_arrays(task.reference))  # type: ignore[arg-type]
     return folder / GRAPH_FILE
 
 
@@ -192,6 +203,7 @@ def metadata_of(cfg: DictConfig, graph: PolicyGraph, task: Task) -> dict[str, st
         "start_noise": json.dumps(_start_noise(cfg, reference)),
         "tracked_joints": ",".join(_matching(cfg, "joints", robot.joint_names)),
         "tracked_bodies": ",".join(_matching(cfg, "bodies", robot.body_names)),
+        "object_joint": json.dumps(_object_joint(cfg)),
         "terminations": json.dumps(known),
         "unchecked_terminations": ",".join(unchecked),
         "quaternions": "wxyz",
@@ -241,6 +253,12 @@ def _start_noise(cfg: DictConfig, reference: Reference) -> dict[str, Any]:
     return {
         key: (np.asarray(value) * (held if key.startswith("object") else 1.0)).tolist() for key, value in noise.items()
     }
+
+
+def _object_joint(cfg: DictConfig) -> dict[str, list[float]]:
+    """Ranges of dry friction (N m) and damping (N m s/rad) of the object's joint in training, if it is randomized."""
+    node = (cfg.randomization or {}).get("object_joint")
+    return {} if node is None else {key: [float(value) for value in node[key]] for key in ("friction", "damping")}
 
 
 def _matching(cfg: DictConfig, kind: str, names: Sequence[str]) -> list[str]:

@@ -90,7 +90,7 @@ class Policy:
             given = {f"state.{name}": value for name, value in json.loads(text).items()}
         except (ValueError, AttributeError) as error:
             raise PolicyError(f"{where}: metadata 'state' cannot be read: {error}") from error
-        state = {}
+        state: dict[str, np.ndarray] = {}
         for name, value in inputs.items():
             if not name.startswith("state."):
                 continue

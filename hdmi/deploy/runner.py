@@ -25,7 +25,7 @@ class State(StrEnum):
     DAMPING = "damping"  # no stiffness: it sinks or hangs
     TO_START = "to_start"  # slowly to the first frame's joint positions, and holds them
     RUN = "run"  # the policy
-    HOLD = "hold"  # the last targets
+    HOLD = "hold"  # the motion's last frame, by the policy; from elsewhere the last targets
 
 
 # What may be asked for, and in which states.
@@ -42,7 +42,7 @@ class Options:
 
     to_start: float = 3.0  # s from the present joint positions to those of the first frame
     settle: float = 0.5  # s at the first frame before the policy may run
-    hold: float = 1.0  # s of the last target after the motion's end; with auto, then damping
+    hold: float = 1.0  # s that the policy goes on at the last frame; with auto, then damping
     auto: bool = False  # states follow by themselves: to the start, the motion, hold, damping
     patience: float = 5.0  # s that auto waits for sensors and for the robot to be at the start
     start_frame: int = 0  # of the motion
@@ -133,7 +133,8 @@ class Runner:
                 "limits": asdict(self.limits),
             }
         )
-        self._ended = False
+        self._ended = self._finished = False
+        self._late = 0.0  # s by which the present tick comes after its time
         self._reached_end = False
         self._entered = self._began = 0.0
         self._from = np.zeros(len(description.joint_names))
@@ -158,27 +159,42 @@ class Runner:
         """
         with Interrupts() as interrupts:
             try:
-                due = self._began = self.robot.time()
-                self._first = first
-                while True:
-                    self._tick(due)
-                    if interrupts.asked:
-                        self._fail("interrupted")
-                    if self._ended:
-                        break
-                    due = self._wait(due)
-            except KeyboardInterrupt:
-                self._fail("interrupted")
-            except BaseException as error:
-                self._fail(f"{type(error).__name__}: {error}")
-                raise
+                try:
+                    self._loop(first, interrupts)
+                except KeyboardInterrupt:
+                    self.failure = "interrupted"
+                except BaseException as error:
+                    self.failure = f"{type(error).__name__}: {error}"
+                    raise
+                finally:
+                    self._finish(interrupts, log)
             finally:
-                done = [self.robot.damp] + ([] if log is None else [lambda: self.log.write(log)])
-                errors = interrupts.shield(done)
-                self.state = State.DAMPING
-            if errors:
-                raise errors[0]
+                # once more, if the one interrupt that is raised came just before
+                self._finish(interrupts, log)
         return self.log
+
+    def _loop(self, first: State, interrupts: Interrupts) -> None:
+        self._first = first
+        due = self._began = self.robot.time()
+        while True:
+            self._tick()
+            if interrupts.asked:
+                self._fail("interrupted")
+            if self._ended:
+                return
+            due = self._wait(due)
+
+    def _finish(self, interrupts: Interrupts, log: str | Path | None) -> None:
+        """Damps, and then writes the log; a second time does nothing."""
+        if self._finished:
+            return
+        before, self.state = self.state, State.DAMPING
+        if before is not State.DAMPING:
+            self.log.events.append((self._now, f"{before} -> damping: {self.failure}"))
+        errors = interrupts.shield([self.robot.damp, *([] if log is None else [lambda: self.log.write(log)])])
+        self._finished = True
+        if errors:
+            raise errors[0]
 
     @property
     def completed(self) -> bool:
@@ -197,14 +213,14 @@ class Runner:
             self.robot.wait(at)
             self._command(self._joints(self.robot.read().sensors))
         self.robot.wait(after)
+        self._late = max(self.robot.time() - after, 0.0)
         # a tick that was missed is not made up for: the motion waits
-        return after if self.robot.time() < after + period else self.robot.time()
+        return after if self._late < period else after + self._late
 
-    def _tick(self, due: float) -> None:
+    def _tick(self) -> None:
         clock = time.perf_counter()
         reading = self.robot.read()
-        late = max(self.robot.time() - due, 0.0)
-        sensors = self.guard.accept(reading, late)
+        sensors = self.guard.accept(reading, self._late)
         for name in ("joint_pos", "joint_vel"):
             if name in sensors:
                 sensors[name] = sensors[name][self._index]
@@ -215,10 +231,11 @@ class Runner:
             self._obey(request)
         self._go_on()
         target = self._act(sensors)
-        row = {
-            "time": reading.time, "late": late, "state": list(State).index(self.state), "frame": -1, "reset": False,
+        row: dict[str, object] = {
+            "time": reading.time, "late": self._late, "state": list(State).index(self.state),
+            "frame": -1, "reset": False,
         }  # fmt: skip
-        if target is not None and self.state is State.RUN:
+        if target is not None and self._policy_acts:
             row |= {"frame": self.policy.frame, "reset": self._fresh, "target": target}
             self._fresh = False
         self._target = target
@@ -285,9 +302,9 @@ class Runner:
             self._from = self._sensors["joint_pos"].astype(float)
         elif state is State.RUN:
             self.policy.reset(self.options.start_frame)
-            self._fresh, self._reached_end = True, False
+            self._fresh = True
         if state in (State.TO_START, State.RUN):
-            self.failure = None
+            self.failure, self._reached_end = None, False
 
     def _obey(self, request: str) -> None:
         """Does what the operator asks, or says why not."""
@@ -329,7 +346,7 @@ class Runner:
             return f"{self.description.joint_names[i]} is {off[i]:.2f} rad off the first frame"
         for name, most in (("root_pos_w", options.start_root), ("object_pos_w", options.start_object)):
             if name in needed and (far := float(np.linalg.norm(sensors[name] - start[name]))) > most:
-                return f"{name} is {far:.2f} m off the first frame: {np.round(sensors[name], 2).tolist()}"
+                return f"{name} is {far:.2f} m off the first frame, at {np.array2string(sensors[name], precision=2)}"
         angle = float(quat_angle(sensors["root_quat_w"].astype(float), start["root_quat_w"]))
         if "root_pos_w" in needed and angle > options.start_heading:
             return f"root_quat_w is {angle:.2f} rad off the first frame"
@@ -368,12 +385,14 @@ class Runner:
             share = min((self._now - self._entered) / self.options.to_start, 1.0) if self.options.to_start > 0 else 1.0
             smooth = share * share * (3.0 - 2.0 * share)
             return self._from + smooth * (self.description.start["joint_pos"] - self._from)
-        if self.state is State.RUN:
+        if self._policy_acts:
             try:
                 return self.policy({name: sensors[name] for name in self.policy.sensors})
             except (ArithmeticError, ValueError) as error:
                 self._fail(f"the policy fails: {error}")
                 return None
-        if self.state is State.HOLD:
-            return self._target
-        return None
+        return self._target if self.state is State.HOLD else None
+
+    @property
+    def _policy_acts(self) -> bool:
+        return self.state is State.RUN or (self.state is State.HOLD and self._reached_end)

@@ -100,10 +100,6 @@ class Guard:
         setattr(self.counts, what, getattr(self.counts, what) + now)
         self._in_a_row[what] = (self._in_a_row[what] + 1) * now
 
-    def forgive(self) -> None:
-        """Late ticks in a row start again: after a state in which nobody waited for the clock."""
-        self._in_a_row["late"] = 0
-
     def not_ready(self, sensors: dict[str, np.ndarray]) -> str | None:
         """Why servos must not be switched on now, or None."""
         if missing := [name for name in self.needed if name not in sensors]:

@@ -147,7 +147,6 @@ class Judge:
         for name, term in self.description.terminations.items():
             holds = any((errors[key] > most).any() for key, most in term.errors.items() if key in errors)
             self._persisted[name] = (self._persisted[name] + 1) * holds
-            # the first frame is the start, which the trainer does not judge
             if self._persisted[name] >= term.min_steps:
                 return name
         tilt = tilt_of(data.xquat[self.robot.root]) - tilt_of(ref["root_quat_w"][frame])
@@ -169,10 +168,11 @@ def _local(
     return quat_apply_inverse(yaw, pos - ground[..., None, :]), quat_multiply(quat_conjugate(yaw), quat)
 
 
-def summarize(results: list[Result]) -> dict[str, float]:
+def summarize(results: list[Result], num_frames: int) -> dict[str, float]:
     """Figures over episodes: `success_rate` and `survival` as shares, errors, `ms_mean`, `ms_p99`."""
     ms = np.concatenate([result.ms for result in results])
     figures = {"success_rate": float(np.mean([result.success for result in results]))}
+    figures["survival"] = float(np.mean([result.frames / num_frames for result in results]))
     for name in results[0].errors:
         figures[f"{name}_error"] = float(np.mean([result.errors[name] for result in results if name in result.errors]))
     return figures | {"ms_mean": float(ms.mean()), "ms_p99": float(np.percentile(ms, 99))}

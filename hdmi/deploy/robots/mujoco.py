@@ -2,7 +2,8 @@
 
 The scene is the policy's `scene.xml`, stepped at 2 ms with the implicit integrator instead of the training's. Servos
 are what motor drivers are: torque = stiffness (target - q), clipped to the effort limits, and damping, integrated
-implicitly as the joint's. The clock is the simulation's, so that runs are as fast as the machine.
+implicitly as the joint's. The object's joint has dry friction and damping from the middle of the training's ranges. The
+clock is the simulation's, so that runs are as fast as the machine.
 """
 
 from __future__ import annotations
@@ -130,6 +131,10 @@ class MujocoRobot:
         model.actuator_forcelimited[self._servos] = True
         model.actuator_forcerange[self._servos] = np.stack([-limits, limits], axis=1)
         model.dof_frictionloss[self._dof] += options.friction_loss
+        if self._object_hinge is not None and description.object_joint:
+            dof = model.jnt_dofadr[self._object_hinge]
+            model.dof_frictionloss[dof] = description.object_joint["friction"].mean()
+            model.dof_damping[dof] = description.object_joint["damping"].mean()
         robot = np.flatnonzero(model.body_rootid == model.body_rootid[self.root])
         model.body_mass[robot] *= options.mass_scale
         model.body_inertia[robot] *= options.mass_scale
@@ -182,11 +187,13 @@ class MujocoRobot:
         self._askew = quat_from_rotation_vector(axis / np.linalg.norm(axis) * rng.uniform(-1.0, 1.0) * o.tilt_bias)
         self._commands: deque[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = deque()
         self._mocap: dict[str, np.ndarray] = {}
-        self._mocap_stamp, self._mocap_next = 0.0, 0.0
+        self._mocap_next = 0.0
         self._captured: deque[tuple[float, dict[str, np.ndarray]]] = deque()
         self._wall = time.perf_counter()
         self.damp()
         mujoco.mj_forward(model, data)
+        # the robot has stood there for a while: a frame has arrived
+        self._mocap_stamp, self._mocap = -o.mocap_latency, self._frame()
 
     @property
     def diverged(self) -> bool:
@@ -262,21 +269,25 @@ class MujocoRobot:
 
     def _capture(self, now: float) -> None:
         """A frame of motion capture, and what has arrived of the ones before."""
-        data, o, rng = self.data, self.options, self._rng
+        o = self.options
         if now >= self._mocap_next - 1e-9:
             self._mocap_next = now + 1.0 / o.mocap_rate if o.mocap_rate else now
-            if rng.uniform() >= o.mocap_dropout:
-                half = o.mocap_noise
-                frame = {"root_pos_w": data.qpos[self._root_qpos : self._root_qpos + 3] + rng.uniform(-half, half, 3)}
-                if self.object_body is not None:
-                    turn = quat_from_rotation_vector(rng.uniform(-half, half, 3))
-                    frame["object_pos_w"] = data.xpos[self.object_body] + rng.uniform(-half, half, 3)
-                    frame["object_quat_w"] = quat_multiply(data.xquat[self.object_body], turn)
-                    if self._object_hinge is not None:
-                        frame["object_joint_pos"] = self.object_joint_pos() + rng.uniform(-half, half, 1)
-                self._captured.append((now, frame))
+            if self._rng.uniform() >= o.mocap_dropout:
+                self._captured.append((now, self._frame()))
         while self._captured and self._captured[0][0] + o.mocap_latency <= now + 1e-9:
             self._mocap_stamp, self._mocap = self._captured.popleft()
+
+    def _frame(self) -> dict[str, np.ndarray]:
+        """What motion capture sees now."""
+        data, rng, half = self.data, self._rng, self.options.mocap_noise
+        frame = {"root_pos_w": data.qpos[self._root_qpos : self._root_qpos + 3] + rng.uniform(-half, half, 3)}
+        if self.object_body is not None:
+            turn = quat_from_rotation_vector(rng.uniform(-half, half, 3))
+            frame["object_pos_w"] = data.xpos[self.object_body] + rng.uniform(-half, half, 3)
+            frame["object_quat_w"] = quat_multiply(data.xquat[self.object_body], turn)
+            if self._object_hinge is not None:
+                frame["object_joint_pos"] = self.object_joint_pos() + rng.uniform(-half, half, 1)
+        return frame
 
     def command(self, target: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:
         if self.options.action_delay <= 0:
