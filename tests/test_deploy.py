@@ -305,6 +305,15 @@ def test_trouble_counts_in_every_state_with_stiffness(start: State):
     assert robot.calls[-6:] == ["damp"] * 6
 
 
+def test_a_motion_may_lean():
+    leans = after(5, root_quat_w=[0.8, 0.6, 0.0, 0.0])  # 1.29 rad
+    robot = ToyRobot(leans)
+    robot.pos = np.array([0.1, 0.2])
+    runner = Runner(ToyPolicy(description(max_tilt=0.6)), robot, AUTO)
+    runner.run(State.RUN)
+    assert runner.completed
+
+
 def test_a_robot_that_reports_a_fault_is_damped():
     robot = ToyRobot()
     robot.pos, robot.faults = np.array([0.1, 0.2]), {5: ("knee is hot",)}
@@ -682,6 +691,7 @@ def test_metadata_says_what_an_evaluation_needs(exported: Path):
     assert about.terminations["object_pose"] == Termination({"object_pos": 0.12, "object_ori": 1.2}, 25)
     assert set(about.terminations) == {"root_pose", "body_local_pose", "object_pose"}
     assert about.unchecked == ("lost_contact",)
+    assert about.max_tilt == pytest.approx(0.0, abs=0.01)
     assert len(about.tracked_joints) == 23
     assert about.start_noise["joint_pos"] == pytest.approx(0.03)  # the preset's
     reference = read_reference(exported, about)
@@ -888,7 +898,7 @@ def test_episodes_log_replay_and_plot(exported: Path, tmp_path: Path, capsys: py
 
 def test_all_states_in_simulation(exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     log = tmp_path / "log.npz"
-    options = ["robot=mujoco", "gantry=100", "auto=true", "to_start=0.2", "settle=0.1", "hold=0.1", "start_frame=280"]
+    options = ["robot=mujoco", "gantry=100", "auto=true", "to_start=0.2", "settle=0.1", "hold=0.1"]
     assert command("deploy").main([f"policy={exported}", *options, f"log={log}", "effort=0", "keys=false"]) == 0
     header, arrays = read_log(log)
     numbers = [header["states"].index(name) for name in ("to_start", "run", "hold")]
@@ -920,7 +930,7 @@ def test_mistakes_are_one_line(arguments: list[str], text: str, exported: Path, 
 def test_help_names_every_option(capsys: pytest.CaptureFixture[str]):
     assert command("deploy").main(["--help"]) == 0
     shown = capsys.readouterr().out
-    for option in ("to_start=3.0", "tilt=1.0", "mocap_latency=0.0", "episodes"):
+    for option in ("to_start=3.0", "tilt=0.7", "mocap_latency=0.0", "episodes"):
         assert option in shown
 
 
@@ -929,7 +939,7 @@ import sys
 for name in ("torch", "torchrl", "tensordict", "hydra", "omegaconf", "onnx", "scipy", "trimesh", "wandb", "matplotlib"):
     sys.modules[name] = None  # importing it fails
 from hdmi.commands.deploy import main
-status = main([f"policy={sys.argv[1]}", "robot=mujoco", "episodes=1", "start_frame=285", "log=" + sys.argv[2]])
+status = main([f"policy={sys.argv[1]}", "robot=mujoco", "episodes=1", "log=" + sys.argv[2]])
 assert not [name for name in sys.modules if name.startswith(("hdmi.learning", "hdmi.transforms", "hdmi.config"))]
 sys.exit(status)
 """

@@ -20,6 +20,7 @@ LAYERS = (
     ("order",),
     ("assembly",),
     ("learning",),
+    ("deploy",),
     ("evaluation",),
     ("workshop",),
     ("tasks",),

@@ -166,6 +166,8 @@ def results_table(results: list[Any], policy: Policy) -> Table:
 
 
 def _counts(drive: Any) -> str:
+    if not drive.log.rows:
+        return "no ticks"
     ms = np.array([row["ms"] for row in drive.log.rows])
     counts = ", ".join(f"{name} {count}" for name, count in vars(drive.guard.counts).items())
     return f"{len(ms)} ticks, {ms.mean():.2f} ms each (99 %: {np.percentile(ms, 99):.2f}); {counts}"

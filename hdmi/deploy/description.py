@@ -44,6 +44,7 @@ class Description:
         sensors: shapes of all that the kind of robot measures; a policy may need fewer.
         start: the first frame: `joint_pos`, `root_pos_w`, `root_quat_w`, with an object `object_pos_w`,
             `object_quat_w`, `object_joint_pos`; velocities `joint_vel`, `root_lin_vel_w`, `root_ang_vel_w`.
+        max_tilt: largest angle between the root's z axis and the vertical in the motion, rad.
         start_noise: half ranges of the perturbations that training starts the first frame with.
         object_joint: ranges of `friction` (N m, dry) and `damping` (N m s/rad) of the object's joint in training.
         tracked_joints, tracked_bodies: what the errors of an evaluation are of.
@@ -66,6 +67,7 @@ class Description:
     root: str
     sensors: Mapping[str, tuple[int, ...]]
     start: Mapping[str, np.ndarray]
+    max_tilt: float = 0.0
     start_noise: Mapping[str, Any] = field(default_factory=dict)
     object_joint: Mapping[str, np.ndarray] = field(default_factory=dict)
     tracked_joints: tuple[str, ...] = ()
@@ -150,6 +152,7 @@ def read_description(metadata: Mapping[str, str], where: str) -> Description:
         root=entry("anchor_body_name", str),
         sensors=sensors,
         start=start,
+        max_tilt=entry("max_tilt", float, 0.0),
         start_noise=entry("start_noise", arrays, {}),
         object_joint=entry("object_joint", arrays, {}),
         tracked_joints=entry("tracked_joints", _names, names),

@@ -21,6 +21,7 @@ from hdmi import __version__
 from hdmi.assembly import Task, make_env, make_task, make_transforms
 from hdmi.deploy.format import FORMAT, GRAPH_FILE, REFERENCE_FILE, SCENE_FILE, SENSORS
 from hdmi.deploy.graph import UNMEASURED, DeploymentError, Measured, PolicyGraph, name_of
+from hdmi.deploy.rotations import tilt_of
 from hdmi.learning.checkpoint import find_checkpoint, load_checkpoint
 from hdmi.learning.policy import make_networks
 from hdmi.motion import Reference
@@ -200,6 +201,7 @@ def metadata_of(cfg: DictConfig, graph: PolicyGraph, task: Task) -> dict[str, st
         "sensors": json.dumps(inputs),
         "state": json.dumps({name.removeprefix("state."): value.tolist() for name, value in _state(graph).items()}),
         "start": json.dumps({name: value.tolist() for name, value in start.items()}),
+        "max_tilt": str(float(tilt_of(arrays["root_quat_w"]).max())),
         "start_noise": json.dumps(_start_noise(cfg, reference)),
         "tracked_joints": ",".join(_matching(cfg, "joints", robot.joint_names)),
         "tracked_bodies": ",".join(_matching(cfg, "bodies", robot.body_names)),

@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from hdmi.deploy.description import Description, PolicyError
+from hdmi.deploy.log import LogError
 from hdmi.deploy.rotations import quat_angle
 from hdmi.deploy.trial import read_reference
 
@@ -35,8 +36,11 @@ def plot_log(
         folder: with the motion, `reference.npz`; without it tracking is shown against targets alone.
 
     Raises:
+        LogError: if the log has no ticks.
         OSError: if the picture cannot be written.
     """
+    if "time" not in arrays:
+        raise LogError("the log has no ticks to draw")
     time = arrays["time"] - arrays["time"][0]
     frame = arrays["frame"]
     reference = _reference(folder, description)

@@ -45,7 +45,6 @@ class Options:
     hold: float = 1.0  # s that the policy goes on at the last frame; with auto, then damping
     auto: bool = False  # states follow by themselves: to the start, the motion, hold, damping
     patience: float = 5.0  # s that auto waits for sensors and for the robot to be at the start
-    start_frame: int = 0  # of the motion
     start_joints: float = 0.3  # rad that a joint may be off the first frame when the policy begins
     start_root: float = 0.5  # m that the root may be off, if the policy depends on where it is
     start_heading: float = 0.5  # rad, likewise
@@ -301,7 +300,7 @@ class Runner:
         elif state is State.TO_START:
             self._from = self._sensors["joint_pos"].astype(float)
         elif state is State.RUN:
-            self.policy.reset(self.options.start_frame)
+            self.policy.reset()
             self._fresh = True
         if state in (State.TO_START, State.RUN):
             self.failure, self._reached_end = None, False
@@ -338,8 +337,6 @@ class Runner:
     def _off_start(self) -> str | None:
         """How robot and object are off the motion's first frame, or None."""
         sensors, start, options, needed = self._sensors, self.description.start, self.options, self.policy.sensors
-        if options.start_frame:  # whose pose the description does not have
-            return None
         off = np.abs(sensors["joint_pos"] - start["joint_pos"])
         if off.max() > options.start_joints:
             i = int(off.argmax())

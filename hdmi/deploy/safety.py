@@ -23,7 +23,7 @@ class Limits:
     range_margin: float = 0.1  # rad beyond the range at which a measured joint means damping
     velocity: float = 1.0  # share of the motors' velocity limits at which a measured speed means damping
     effort: float = 1.0  # share of the effort limits that a target may ask for; 0 leaves the limit to the motors
-    tilt: float = 1.0  # rad between the root's z axis and the vertical at which to damp
+    tilt: float = 0.7  # rad that the root may be tilted more than the motion ever is; beyond it: damping
     encoder_age: float = 0.05  # s after which measurements of encoders and IMU are stale
     mocap_age: float = 0.1  # s after which those of motion capture are
     late: float = 0.01  # s after its time that a tick counts as late
@@ -134,7 +134,7 @@ class Guard:
             i = int(share.argmax())
             return f"{description.joint_names[i]} turns at {sensors['joint_vel'][i]:.1f} rad/s"
         tilt = float(tilt_of(sensors["root_quat_w"]))
-        if tilt > limits.tilt:
+        if tilt > description.max_tilt + limits.tilt:
             return f"{description.root} is tilted by {tilt:.2f} rad"
         return None
 
