@@ -20,21 +20,13 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from hdmi.errors import ConfigError as ConfigError
+
 # beside the package in a checkout, in the package when it is installed
 CONF = next(path for path in (Path(__file__).parent / "conf", Path(__file__).parents[1] / "conf") if path.is_dir())
 
 
 _ENTRY_POINTS = "hdmi.configs"  # by which packages name their config folders
-
-
-class ConfigError(ValueError):
-    """A config that cannot be built; the message names the node.
-
-    Examples:
-        >>> build({"_target_": "hdmi.assets.SimConfig", "step": 0.01}, "sim")
-        Traceback (most recent call last):
-        hdmi.config.ConfigError: sim: SimConfig has no ['step']; it takes ...
-    """
 
 
 def build(node: Any, where: str, **context: Any) -> Any:

@@ -21,6 +21,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MODULES = [
     "hdmi.assembly",
     "hdmi.config",
+    "hdmi.errors",
     "hdmi.tasks.catalogue",
     "hdmi.tasks.check",
     "hdmi.tasks.gallery",

@@ -387,7 +387,7 @@ def test_an_exported_policy_acts_like_its_checkpoint(
     out = tmp_path / "zoo" / "lift_box"
     assert command("export").main([f"checkpoint={run}", f"out={out}", "num_envs=2"]) == 0
     assert {path.name for path in out.iterdir()} == {
-        "policy.pt", "policy.onnx", "scene.xml", "config.yaml", "eval.json", "video.mp4", "README.md",
+        "policy.pt", "policy.onnx", "scene.xml", "reference.npz", "config.yaml", "eval.json", "video.mp4", "README.md",
     }  # fmt: skip
     original, exported = (load_policy(path)[0] for path in (run, out))
     assert original.state_dict().keys() == exported.state_dict().keys()

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 # From what depends on nothing to what depends on everything: a part may import those of the lines above it, and itself.
 LAYERS = (
-    ("console", "metrics", "names", "threads"),
+    ("console", "errors", "metrics", "names", "threads"),
     ("functional",),
     ("assets",),
     ("motion",),

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from hdmi.config import ConfigError
+from hdmi.errors import ConfigError
 
 T = TypeVar("T")
 

@@ -13,6 +13,7 @@ VERBS = {
     "play": "plays a policy, or an agent that needs none, as a video or in a window",
     "plot": "learning curves of runs side by side",
     "export": "writes a policy alone, with evaluation, video and a card",
+    "deploy": "runs an exported policy on a robot, real or simulated",
     "tasks": "lists the tasks, checks them, or renders a picture of each",
     "retarget": "from a person's motion to the robot's",
     "convert": "reference motions from and to other projects' formats",

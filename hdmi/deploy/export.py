@@ -6,10 +6,11 @@ import hashlib
 import json
 import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import onnx
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -18,12 +19,17 @@ from torch import Tensor, nn
 
 import hdmi
 from hdmi.assembly import Task, make_env, make_task, make_transforms
-from hdmi.deploy.format import FORMAT, GRAPH_FILE, SCENE_FILE, SENSORS, DeploymentError
+from hdmi.deploy.format import FORMAT, GRAPH_FILE, REFERENCE_FILE, SCENE_FILE, SENSORS, DeploymentError
 from hdmi.deploy.graph import UNMEASURED, Measured, PolicyGraph, name_of
+from hdmi.deploy.rotations import tilt_of
 from hdmi.learning.checkpoint import find_checkpoint, load_checkpoint
 from hdmi.learning.policy import make_networks
+from hdmi.motion import Reference
+from hdmi.names import match_names
 
 OPSET = 20
+# Errors that follow from poses of robot and object and from the motion.
+COMPARED = ("root_pos", "root_ori", "body_pos", "body_ori", "object_pos", "object_ori", "object_joint")
 
 
 def make_graph(cfg: DictConfig, actor: nn.Module, task: Task | None = None) -> tuple[PolicyGraph, Task]:
@@ -107,7 +113,7 @@ def _reached(model: onnx.ModelProto) -> set[str]:
 
 
 def export_graph(checkpoint: str | Path, folder: str | Path) -> Path:
-    """Writes `policy.onnx` and `scene.xml`, the scene as self-contained MJCF, into a folder.
+    """Writes `policy.onnx`, `scene.xml`, the scene as self-contained MJCF, and `reference.npz` into a folder.
 
     Args:
         checkpoint: a run folder (its newest checkpoint counts), an exported policy, or a checkpoint file.
@@ -127,15 +133,27 @@ def export_graph(checkpoint: str | Path, folder: str | Path) -> Path:
     actor, _ = make_networks(cfg, state["sizes"], torch.device("cpu"))
     actor.load_state_dict(state["actor"])
     graph, task = make_graph(cfg, actor)
-    model = to_onnx(graph)
     digest = hashlib.sha256(json.dumps(state["config"], sort_keys=True).encode()).hexdigest()
-    metadata = metadata_of(cfg, graph, task) | {"config_hash": digest, "training_frames": str(state["frames"])}
-    onnx.helper.set_model_props(model, metadata)
+    return write_graph(cfg, graph, task, folder, {"config_hash": digest, "training_frames": str(state["frames"])})
+
+
+def write_graph(
+    cfg: DictConfig, graph: PolicyGraph, task: Task, folder: str | Path, more: Mapping[str, str] | None = None
+) -> Path:
+    """Writes what `export_graph` says, of a graph; `more` is metadata besides `metadata_of`.
+
+    Raises:
+        DeploymentError: if the policy needs what no robot measures.
+        OSError: if a file cannot be written.
+    """
+    model = to_onnx(graph)
+    onnx.helper.set_model_props(model, metadata_of(cfg, graph, task) | dict(more or {}))
     onnx.checker.check_model(model)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / GRAPH_FILE).write_bytes(model.SerializeToString())
     (folder / SCENE_FILE).write_text(task.scene.xml, encoding="utf-8")
+    np.savez_compressed(folder / REFERENCE_FILE, **reference_arrays(task.reference))  # type: ignore[arg-type]
     return folder / GRAPH_FILE
 
 
@@ -146,19 +164,17 @@ def metadata_of(cfg: DictConfig, graph: PolicyGraph, task: Task) -> dict[str, st
     `default_joint_pos`, `action_scale`, `observation_names`, `body_names`, `anchor_body_name`.
     """
     robot, reference = task.scene.robot, task.reference
+    arrays = reference_arrays(reference)
     scale = torch.zeros(len(robot.joint_names))
     for _, transform in graph.inverse:
         if hasattr(transform, "scale"):
             scale[transform.index] = transform.scale
-    start: dict[str, Any] = {
-        "joint_pos": reference.joint_pos[0],
-        "root_pos_w": reference.body_pos[0, 0],
-        "root_quat_w": reference.body_quat[0, 0],
+    start: dict[str, Any] = {name: value[0] for name, value in arrays.items()} | {
+        "joint_vel": reference.joint_vel[0].numpy(),
+        "root_lin_vel_w": reference.body_lin_vel[0, 0].numpy(),
+        "root_ang_vel_w": reference.body_ang_vel[0, 0].numpy(),
     }
-    if reference.has_object:
-        start |= {"object_pos_w": reference.object_pos[0], "object_quat_w": reference.object_quat[0]}
-        if "object_joint_pos" in graph.measured.sensors:
-            start["object_joint_pos"] = reference.object_joint_pos[0]
+    known, unchecked = _terminations(cfg)
     inputs = {name: {"shape": list(shape)} | SENSORS[name] for name, shape in graph.measured.sensors.items()}
     return {
         "format": FORMAT,
@@ -185,8 +201,72 @@ def metadata_of(cfg: DictConfig, graph: PolicyGraph, task: Task) -> dict[str, st
         "sensors": json.dumps(inputs),
         "state": json.dumps({name.removeprefix("state."): value.tolist() for name, value in _state(graph).items()}),
         "start": json.dumps({name: value.tolist() for name, value in start.items()}),
+        "max_tilt": str(float(tilt_of(arrays["root_quat_w"]).max())),
+        "start_noise": json.dumps(_start_noise(cfg, reference)),
+        "tracked_joints": ",".join(_matching(cfg, "joints", robot.joint_names)),
+        "tracked_bodies": ",".join(_matching(cfg, "bodies", robot.body_names)),
+        "object_joint": json.dumps(_object_joint(cfg)),
+        "terminations": json.dumps(known),
+        "unchecked_terminations": ",".join(unchecked),
         "quaternions": "wxyz",
     }
+
+
+def reference_arrays(reference: Reference) -> dict[str, np.ndarray]:
+    """A motion as `hdmi.deploy.format.REFERENCE` has it: the poses that sensors can be held against. float32 [T, *]"""
+    arrays = {
+        "joint_pos": reference.joint_pos,
+        "root_pos_w": reference.body_pos[:, 0],
+        "root_quat_w": reference.body_quat[:, 0],
+    }
+    if reference.has_object:
+        arrays |= {"object_pos_w": reference.object_pos, "object_quat_w": reference.object_quat}
+        if reference.object_joint_pos.shape[-1]:
+            arrays["object_joint_pos"] = reference.object_joint_pos
+    return {name: value.numpy().astype(np.float32) for name, value in arrays.items()}
+
+
+def _terminations(cfg: DictConfig) -> tuple[dict[str, Any], list[str]]:
+    """Those that compare poses with the motion's, as numbers, and the names of the others."""
+    known: dict[str, Any] = {}
+    unchecked: list[str] = []
+    for name, node in (cfg.termination or {}).items():
+        if node is None:
+            continue
+        errors = [str(key[-1]) if key[0] == "error" else None for key in node.get("errors", [None]) if key is not None]
+        if str(node["_target_"]).endswith(".ErrorTermination") and errors and set(errors) <= set(COMPARED):
+            thresholds = [float(value) for value in node.thresholds]
+            known[str(name)] = {
+                "errors": dict(zip(errors, thresholds, strict=True)), "min_steps": int(node.get("min_steps", 25)),
+            }  # fmt: skip
+        else:
+            unchecked.append(str(name))
+    return known, unchecked
+
+
+def _start_noise(cfg: DictConfig, reference: Reference) -> dict[str, Any]:
+    """Half ranges of the perturbations at the first frame, m, rad and per second; none of an object that is held."""
+    node = (cfg.reset or {}).get("state") or {}
+    noise = {
+        str(key): OmegaConf.to_container(value) if OmegaConf.is_config(value) else float(value)
+        for key, value in (node.get("noise") or {}).items()
+    }
+    held = float(node.get("held_noise", 1.0)) if bool(reference.contact[0].any()) else 1.0
+    return {
+        key: (np.asarray(value) * (held if key.startswith("object") else 1.0)).tolist() for key, value in noise.items()
+    }
+
+
+def _object_joint(cfg: DictConfig) -> dict[str, list[float]]:
+    """Ranges of dry friction (N m) and damping (N m s/rad) of the object's joint in training, if it is randomized."""
+    node = (cfg.randomization or {}).get("object_joint")
+    return {} if node is None else {key: [float(value) for value in node[key]] for key in ("friction", "damping")}
+
+
+def _matching(cfg: DictConfig, kind: str, names: Sequence[str]) -> list[str]:
+    """What the errors of an evaluation are of, by the config's patterns; everything if it has none."""
+    patterns = (cfg.get("reference_set") or {}).get(kind)
+    return list(names) if patterns is None else [names[i] for i in match_names(list(patterns), names, kind)]
 
 
 def _state(graph: PolicyGraph) -> Mapping[str, Tensor]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 
 class DeploymentError(ValueError):
-    """A policy that cannot leave the trainer, or cannot be run; the message names what is wrong with it."""
+    """A policy that cannot leave the trainer; the message names what is wrong with it."""
 
 
 FORMAT = "hdmi-policy/1"
 GRAPH_FILE = "policy.onnx"
 SCENE_FILE = "scene.xml"
+REFERENCE_FILE = "reference.npz"
 TARGET = "joint_pos_target"  # rad, [J]
 
 # World frame, quaternions wxyz, SI units.
@@ -23,3 +24,8 @@ SENSORS: dict[str, dict[str, str]] = {
     "object_quat_w": {"unit": "1", "frame": "world", "source": "motion capture"},
     "object_joint_pos": {"unit": "rad", "frame": "joint", "source": "motion capture"},
 }
+
+# float32, a row for each frame of the motion; the object's only with an object.
+REFERENCE = (
+    "joint_pos", "root_pos_w", "root_quat_w", "object_pos_w", "object_quat_w", "object_joint_pos",
+)  # fmt: skip

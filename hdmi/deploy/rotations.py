@@ -1,0 +1,68 @@
+"""Rotations in numpy: quaternions wxyz, batched over the leading dimensions."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Hamilton product. [..., 4], [..., 4] -> [..., 4]"""
+    w, x, y, z = np.moveaxis(a, -1, 0)
+    W, X, Y, Z = np.moveaxis(b, -1, 0)  # noqa: N806
+    product = (
+        w * W - x * X - y * Y - z * Z,
+        w * X + x * W + y * Z - z * Y,
+        w * Y - x * Z + y * W + z * X,
+        w * Z + x * Y - y * X + z * W,
+    )
+    return np.stack(product, axis=-1)
+
+
+def quat_conjugate(quat: np.ndarray) -> np.ndarray:
+    """The inverse of a unit quaternion. [..., 4]"""
+    return quat * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def quat_apply(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Rotates vectors. [..., 4], [..., 3] -> [..., 3]"""
+    axis = quat[..., 1:]
+    turned = 2.0 * np.cross(axis, vector)
+    return vector + quat[..., :1] * turned + np.cross(axis, turned)
+
+
+def quat_apply_inverse(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Rotates vectors back. [..., 4], [..., 3] -> [..., 3]"""
+    return quat_apply(quat_conjugate(quat), vector)
+
+
+def quat_angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle between orientations, rad, in [0, pi]. [..., 4], [..., 4] -> [...]"""
+    difference = quat_multiply(quat_conjugate(a), b)
+    return 2.0 * np.arctan2(np.linalg.norm(difference[..., 1:], axis=-1), np.abs(difference[..., 0]))
+
+
+def quat_from_rotation_vector(vector: np.ndarray) -> np.ndarray:
+    """Rotation about an axis by its length, rad. [..., 3] -> [..., 4]"""
+    half = 0.5 * np.linalg.norm(vector, axis=-1, keepdims=True)
+    # sin(x) / x, also at 0
+    return np.concatenate([np.cos(half), 0.5 * vector * np.sinc(half / np.pi)], axis=-1)
+
+
+def quat_from_euler(angles: np.ndarray) -> np.ndarray:
+    """Roll, pitch and yaw about the fixed axes x, y, z in this order, rad. [..., 3] -> [..., 4]"""
+    turns = [quat_from_rotation_vector(angles[..., i : i + 1] * np.eye(3)[i]) for i in range(3)]
+    return quat_multiply(turns[2], quat_multiply(turns[1], turns[0]))
+
+
+def tilt_of(quat: np.ndarray) -> np.ndarray:
+    """Angle between a body's z axis and the vertical, rad. [..., 4] -> [...]"""
+    x, y = quat[..., 1], quat[..., 2]
+    return np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0))
+
+
+def yaw_of(quat: np.ndarray) -> np.ndarray:
+    """The rotation about the vertical that is left when a body's tilt is taken away. [..., 4] -> [..., 4]"""
+    w, x, y, z = np.moveaxis(quat, -1, 0)
+    half = 0.5 * np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    zero = np.zeros_like(half)
+    return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
