@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import NestedKey
 from torch import Tensor, nn
 
-from hdmi import __version__
+import hdmi
 from hdmi.assembly import Task, make_env, make_task, make_transforms
 from hdmi.deploy.format import FORMAT, GRAPH_FILE, REFERENCE_FILE, SCENE_FILE, SENSORS
 from hdmi.deploy.graph import UNMEASURED, DeploymentError, Measured, PolicyGraph, name_of
@@ -178,7 +178,7 @@ def metadata_of(cfg: DictConfig, graph: PolicyGraph, task: Task) -> dict[str, st
     inputs = {name: {"shape": list(shape)} | SENSORS[name] for name, shape in graph.measured.sensors.items()}
     return {
         "format": FORMAT,
-        "hdmi_version": __version__,
+        "hdmi_version": hdmi.__version__,
         "robot": robot.name,
         "task": task.name,
         "motion": reference.name,
