@@ -244,6 +244,20 @@ def test_servos_are_told_more_often_than_the_policy_is_asked():
     assert all((robot.commands[4 * i] == robot.commands[4 * i + k]).all() for i in range(9) for k in range(4))
 
 
+def test_requests_between_ticks_are_not_lost():
+    robot = ToyRobot()
+    robot.servo_dt, robot.pos = DT / 4, np.array([0.1, 0.2])
+    robot.requests = {6: ("hold",), 15: ("quit",)}  # the second reading of the second tick, the third of the fourth
+    log = Runner(ToyPolicy(), robot, ASKED).run(State.RUN)
+    assert states(log) == ["run", "hold", "damping"]
+    assert [row["frame"] for row in log.rows] == [0, 1, -1, -1, -1]
+    robot = ToyRobot()
+    robot.servo_dt, robot.pos, robot.faults = DT / 4, np.array([0.1, 0.2]), {6: ("knee is hot",)}
+    runner = Runner(ToyPolicy(), robot, AUTO)
+    runner.run(State.RUN)
+    assert runner.failure == "the robot says: knee is hot"
+
+
 # -- what ends in damping -------------------------------------------------------------------------------------
 
 

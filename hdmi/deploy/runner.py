@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Protocol
@@ -14,7 +14,7 @@ import numpy as np
 from hdmi.deploy.controls import QUIT, Controls, Interrupts
 from hdmi.deploy.description import Description
 from hdmi.deploy.log import Log
-from hdmi.deploy.robot import Robot, RobotError
+from hdmi.deploy.robot import Reading, Robot, RobotError
 from hdmi.deploy.rotations import quat_angle
 from hdmi.deploy.safety import Guard, Limits
 
@@ -133,6 +133,8 @@ class Runner:
             }
         )
         self._ended = self._finished = False
+        self._requests: tuple[str, ...] = ()
+        self._faults: tuple[str, ...] = ()
         self._late = 0.0  # s by which the present tick comes after its time
         self._reached_end = False
         self._entered = self._began = 0.0
@@ -210,7 +212,7 @@ class Runner:
             if self.robot.time() > at + every:  # too late for this one
                 continue
             self.robot.wait(at)
-            self._command(self._joints(self.robot.read().sensors))
+            self._command(self._joints(self._read().sensors))
         self.robot.wait(after)
         self._late = max(self.robot.time() - after, 0.0)
         # a tick that was missed is not made up for: the motion waits
@@ -218,16 +220,17 @@ class Runner:
 
     def _tick(self) -> None:
         clock = time.perf_counter()
-        reading = self.robot.read()
-        sensors = self.guard.accept(reading, self._late)
+        reading = self._read()
+        sensors = self.guard.accept(replace(reading, faults=self._faults), self._late)
         for name in ("joint_pos", "joint_vel"):
             if name in sensors:
                 sensors[name] = sensors[name][self._index]
         self._now, self._sensors = reading.time, sensors
         if self.state is not State.DAMPING and (trouble := self.guard.trouble(sensors)):
             self._fail(trouble)
-        for request in (*reading.requests, *(name for source in self.controls for name in source.requests())):
+        for request in (*self._requests, *(name for source in self.controls for name in source.requests())):
             self._obey(request)
+        self._requests, self._faults = (), ()
         self._go_on()
         target = self._act(sensors)
         row: dict[str, object] = {
@@ -252,6 +255,12 @@ class Runner:
         if self.state is State.RUN and self.policy.finished:
             self._reached_end = True
             self._enter(State.HOLD)
+
+    def _read(self) -> Reading:
+        """A reading, of which requests and faults are kept until the next tick."""
+        reading = self.robot.read()
+        self._requests, self._faults = self._requests + reading.requests, self._faults + reading.faults
+        return reading
 
     def _joints(self, sensors: object) -> dict[str, np.ndarray]:
         """Positions and velocities of the policy's joints between ticks; the last ones where they are not finite."""
@@ -291,13 +300,13 @@ class Runner:
         self._ended = self._ended or self.options.auto or self._first is State.RUN or reason == "interrupted"
 
     def _enter(self, state: State, reason: str = "") -> None:
-        if state is not self.state:
-            self._note(f"{self.state} -> {state}" + (f": {reason}" if reason else ""))
-        self.state, self._entered = state, self._now
-        if state is State.DAMPING:
+        if state is State.DAMPING:  # first of all: words may be slow
             self._target = None
             self.robot.damp()
-        elif state is State.TO_START:
+        before, self.state, self._entered = self.state, state, self._now
+        if state is not before:
+            self._note(f"{before} -> {state}" + (f": {reason}" if reason else ""))
+        if state is State.TO_START:
             self._from = self._sensors["joint_pos"].astype(float)
         elif state is State.RUN:
             self.policy.reset()

@@ -114,7 +114,7 @@ class Guard:
         """Why to damp now, or None."""
         limits, description = self.limits, self.description
         if self._faults:
-            return f"the robot says: {'; '.join(self._faults)}"
+            return f"the robot says: {'; '.join(dict.fromkeys(self._faults))}"
         if missing := [name for name in self.needed if name not in sensors]:
             return f"no measurement of {', '.join(missing)}"
         if self._in_a_row["bad"] > limits.bad_ticks:
