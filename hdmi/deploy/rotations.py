@@ -7,8 +7,8 @@ import numpy as np
 
 def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Hamilton product. [..., 4], [..., 4] -> [..., 4]"""
-    w, x, y, z = np.moveaxis(a, -1, 0)
-    W, X, Y, Z = np.moveaxis(b, -1, 0)  # noqa: N806
+    w, x, y, z = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
+    W, X, Y, Z = b[..., 0], b[..., 1], b[..., 2], b[..., 3]  # noqa: N806
     product = (
         w * W - x * X - y * Y - z * Z,
         w * X + x * W + y * Z - z * Y,
@@ -62,7 +62,7 @@ def tilt_of(quat: np.ndarray) -> np.ndarray:
 
 def yaw_of(quat: np.ndarray) -> np.ndarray:
     """The rotation about the vertical that is left when a body's tilt is taken away. [..., 4] -> [..., 4]"""
-    w, x, y, z = np.moveaxis(quat, -1, 0)
+    w, x, y, z = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
     half = 0.5 * np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     zero = np.zeros_like(half)
     return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
