@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from hydra.core.hydra_config import HydraConfig
 from hypothesis import settings
 
 from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene, default_joint_pos, g1, g1_robot
@@ -30,6 +31,13 @@ JOINTS = ("left_knee_joint", "waist_yaw_joint")
 def drawings() -> None:
     """Whatever a test draws from torch's generator is the same in every run."""
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def no_job() -> Iterator[None]:
+    """What a command leaves behind that ran as Hydra's job in this process: the next one is none."""
+    yield
+    HydraConfig.instance().cfg = None
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib import import_module
@@ -205,10 +206,15 @@ def assert_same(a: TensorDictBase, b: TensorDictBase, rows: Tensor | None = None
         assert torch.equal(x, y), key
 
 
-def load_config(*overrides: str) -> DictConfig:
-    """The project's config with overrides."""
+@cache
+def _composed(overrides: tuple[str, ...]) -> DictConfig:
     with initialize_config_dir(str(CONF), version_base=None):
         return compose("config", overrides=["num_threads=1", *overrides])
+
+
+def load_config(*overrides: str) -> DictConfig:
+    """The project's config with overrides."""
+    return copy.deepcopy(_composed(overrides))  # a tenth of the time that composing takes
 
 
 @cache

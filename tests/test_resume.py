@@ -393,7 +393,7 @@ class TestWandb:
             return folder / "video.mp4"
 
         monkeypatch.setattr(wandb, "init", noted)
-        monkeypatch.setattr("hdmi.evaluation.render_checkpoint", video)
+        monkeypatch.setattr(cli, "render_checkpoint", video)
         started = [*SHORT, "logger=offline", "video=true", "seed=3", "+ablation=no_rsi", "total_frames=32"]
         command(cli.train, *started, f"output_dir={tmp_path}", "run_name=run")
         command(cli.train, f"resume={tmp_path / 'run'}", "total_frames=64")
