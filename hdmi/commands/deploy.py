@@ -6,7 +6,9 @@
 
 With `episodes`, a simulated robot begins each episode at the perturbed first frame, and a table shows success, errors
 and timing. Without, the run goes through all states: damping, to the start, run, hold, damping; by itself if
-auto=true, else as keys, a gamepad or the robot's remote control ask for. It always ends in damping. {options}
+auto=true, else as keys, a gamepad or the robot's remote control ask for. It always ends in damping.
+
+{options}
 """
 
 from __future__ import annotations
