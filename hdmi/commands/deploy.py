@@ -6,7 +6,9 @@
 
 With `episodes`, a simulated robot begins each episode at the perturbed first frame, and a table shows success, errors
 and timing. Without, the run goes through all states: damping, to the start, run, hold, damping; by itself if
-auto=true, else as keys, a gamepad or the robot's remote control ask for. It always ends in damping. {options}
+auto=true, else as keys, a gamepad or the robot's remote control ask for. It always ends in damping.
+
+{options}
 """
 
 from __future__ import annotations
@@ -136,7 +138,11 @@ def _episodes(options: Options, values: dict[type, Any], policy: Policy, robot: 
         results.append(Result(drive.failure, judge.frames, judge.means(), ms, vars(drive.guard.counts)))
         if drive.failure == "interrupted":
             return 130
+    about = policy.description
+    console.print(f"{about.task}: {len(results)} episodes of {about.num_frames - 1} steps in MuJoCo", markup=False)
     console.print(results_table(results, policy))
+    checked, unchecked = (", ".join(names) or "none" for names in (about.terminations, about.unchecked))
+    console.print(f"terminations: {checked}; not checked: {unchecked}", markup=False)
     _finish(options, drive, policy)
     return 0
 
@@ -146,8 +152,7 @@ def results_table(results: list[Any], policy: Policy) -> Table:
     from hdmi.deploy.trial import UNITS, summarize
 
     description = policy.description
-    title = f"{description.task}: {len(results)} episodes of {description.num_frames - 1} steps in MuJoCo"
-    table = Table(title=title, title_justify="left")
+    table = Table()
     table.add_column("figure")
     table.add_column("mean", justify="right")
     table.add_column("unit")
@@ -160,8 +165,6 @@ def results_table(results: list[Any], policy: Policy) -> Table:
         frames = [result.frames for result in results if result.failure == failure]
         share = 100 * failures.count(failure) / len(results)
         table.add_row(f"failed by {failure}", f"{share:.1f}", f"%, median frame {np.median(frames):g}")
-    checked = ", ".join(description.terminations) or "none"
-    table.caption = f"terminations: {checked}; not checked: {', '.join(description.unchecked) or 'none'}"
     return table
 
 
