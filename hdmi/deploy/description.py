@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from hdmi.deploy.format import FORMAT, SENSORS
+from hdmi.deploy.format import FORMAT, SENSORS, DeploymentError
 
 
-class PolicyError(ValueError):
+class PolicyError(DeploymentError):
     """A policy's files that cannot be used; the message names file and entry and says what would be right."""
 
 
