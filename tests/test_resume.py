@@ -104,7 +104,7 @@ class TestContinuation:
         "overrides",
         [
             ["seed=3"],
-            ["seed=1", "+ablation=no_randomization"],
+            pytest.param(["seed=1", "+ablation=no_randomization"], marks=pytest.mark.slow),
             ["seed=2", "+ablation=no_interaction_reward_no_contact_termination"],
             ["reset=adaptive", "seed=5"],
         ],

@@ -35,6 +35,7 @@ def test_benchmark_ends_with_its_figures_as_json(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "grid.jsonl").read_text()) == figures
 
 
+@pytest.mark.slow
 def test_benchmark_of_workers_that_collect_during_updates(tmp_path: Path) -> None:
     options = ["num_envs=4", "algo.frames_per_env=4", "num_threads=1", "logger=csv", "compare.steps=0"]
     workers = ["collector=process", "collector.num_workers=2", "collector.threads_per_worker=1"]
