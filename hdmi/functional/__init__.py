@@ -1,5 +1,6 @@
-"""Pure tensor functions: rotations, tracking errors, reward and termination kernels."""
+"""Pure tensor functions: rotations, servo targets, tracking errors, reward and termination kernels."""
 
+from hdmi.functional.control import feedforward_target
 from hdmi.functional.pose import body_velocity, local_pose
 from hdmi.functional.reward import (
     action_rate,
@@ -34,6 +35,7 @@ __all__ = [
     "body_velocity",
     "contact_lost",
     "error_exceeds",
+    "feedforward_target",
     "feet_air_time",
     "feet_impact",
     "feet_slip",

@@ -23,6 +23,7 @@ from hdmi.transforms.action import (
     ResidualAction,
 )
 from hdmi.transforms.concatenate import Concatenate
+from hdmi.transforms.feedforward import FeedForwardTarget
 from hdmi.transforms.observation import (
     Difference,
     EpisodeNoise,
@@ -106,6 +107,7 @@ __all__ = [
     "Distance",
     "EpisodeNoise",
     "ErrorTermination",
+    "FeedForwardTarget",
     "FeetAirTime",
     "FeetImpactL2",
     "FeetSlip",
