@@ -69,13 +69,14 @@ def complete_robot(motion: Motion, robot: RobotConfig | None = None) -> Motion:
     held = robot.held_joints
     joint_pos = np.tile(robot.default_joint_pos, (num_frames, 1))
     joint_vel = np.zeros_like(joint_pos)
-    joint_target = None if motion.joint_target is None else joint_pos.copy()
+    target = motion.joint_target
+    joint_target = joint_pos.copy()
     for i, name in enumerate(motion.joint_names):
         if name in model.joint_names and name not in held:
             j = model.joint_names.index(name)
             joint_pos[:, j], joint_vel[:, j] = motion.joint_pos[:, i], motion.joint_vel[:, i]
-            if joint_target is not None:
-                joint_target[:, j] = motion.joint_target[:, i]
+            if target is not None:
+                joint_target[:, j] = target[:, i]
 
     root = motion.body_names.index(model.root)
     pos, quat = forward_kinematics(model, motion.body_pos_w[:, root], motion.body_quat_w[:, root], joint_pos)
@@ -99,7 +100,7 @@ def complete_robot(motion: Motion, robot: RobotConfig | None = None) -> Motion:
         body_names=(*model.body_names, *(motion.body_names[i] for i in bodies)),
         joint_pos=joined(joint_pos, motion.joint_pos[:, joints]),
         joint_vel=joined(joint_vel, motion.joint_vel[:, joints]),
-        joint_target=None if joint_target is None else joined(joint_target, motion.joint_target[:, joints]),
+        joint_target=None if target is None else joined(joint_target, target[:, joints]),
         body_pos_w=joined(pos, motion.body_pos_w[:, bodies]),
         body_quat_w=joined(quat, motion.body_quat_w[:, bodies]),
         body_lin_vel_w=joined(lin_vel, motion.body_lin_vel_w[:, bodies]),
