@@ -255,6 +255,7 @@ def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
         "servo_damping": robot.damping,
         "reference": task.reference,
         "starts": task.starts,
+        "total_steps": cfg.total_frames // cfg.num_envs,
         "joint_torque": lambda: task.joint_torque,  # a second of work that only some stacks need
         "model": task.scene.model,
         "robot_bodies": task.scene.body_ids.tolist(),

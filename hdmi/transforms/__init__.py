@@ -22,6 +22,7 @@ from hdmi.transforms.action import (
     JointPositionAction,
     ResidualAction,
 )
+from hdmi.transforms.assist import SpringAssist
 from hdmi.transforms.concatenate import Concatenate
 from hdmi.transforms.feedforward import FeedForwardTarget
 from hdmi.transforms.observation import (
@@ -51,6 +52,7 @@ from hdmi.transforms.reference import (
     MotionEnd,
     MotionReference,
     ReferenceStateInitialization,
+    Rewind,
 )
 from hdmi.transforms.reward import (
     ActionRateL2,
@@ -142,6 +144,8 @@ __all__ = [
     "ResidualAction",
     "RewardRate",
     "RewardTerm",
+    "Rewind",
+    "SpringAssist",
     "SurvivalReward",
     "TerminationTerm",
     "TrackedBodies",
