@@ -49,12 +49,12 @@ def _by_bytes(kind: Any) -> Any:
 
 
 _MotorCmd = _struct(
-    "unitree_hg.MotorCmd_", mode=t.uint8, q=t.float32, dq=t.float32, tau=t.float32, kp=t.float32, kd=t.float32,
+    "unitree_hg.MotorCmd_", mode=t.byte, q=t.float32, dq=t.float32, tau=t.float32, kp=t.float32, kd=t.float32,
     reserve=t.uint32,
 )  # fmt: skip
 LowCmd = _by_bytes(
     _struct(
-        "unitree_hg.LowCmd_", mode_pr=t.uint8, mode_machine=t.uint8, motor_cmd=t.array[_MotorCmd, MOTORS],
+        "unitree_hg.LowCmd_", mode_pr=t.byte, mode_machine=t.byte, motor_cmd=t.array[_MotorCmd, MOTORS],
         reserve=t.array[t.uint32, 4], crc=t.uint32,
     )
 )  # fmt: skip
@@ -63,14 +63,14 @@ _IMUState = _struct(
     accelerometer=t.array[t.float32, 3], rpy=t.array[t.float32, 3], temperature=t.int16,
 )  # fmt: skip
 _MotorState = _struct(
-    "unitree_hg.MotorState_", mode=t.uint8, q=t.float32, dq=t.float32, ddq=t.float32, tau_est=t.float32,
+    "unitree_hg.MotorState_", mode=t.byte, q=t.float32, dq=t.float32, ddq=t.float32, tau_est=t.float32,
     temperature=t.array[t.int16, 2], vol=t.float32, sensor=t.array[t.uint32, 2], motorstate=t.uint32,
     reserve=t.array[t.uint32, 4],
 )  # fmt: skip
 LowState = _by_bytes(
     _struct(
-        "unitree_hg.LowState_", version=t.array[t.uint32, 2], mode_pr=t.uint8, mode_machine=t.uint8, tick=t.uint32,
-        imu_state=_IMUState, motor_state=t.array[_MotorState, MOTORS], wireless_remote=t.array[t.uint8, 40],
+        "unitree_hg.LowState_", version=t.array[t.uint32, 2], mode_pr=t.byte, mode_machine=t.byte, tick=t.uint32,
+        imu_state=_IMUState, motor_state=t.array[_MotorState, MOTORS], wireless_remote=t.array[t.byte, 40],
         reserve=t.array[t.uint32, 4], crc=t.uint32,
     )
 )  # fmt: skip
@@ -78,10 +78,10 @@ Identity = _struct("unitree_api.RequestIdentity_", id=t.int64, api_id=t.int64)
 Lease = _struct("unitree_api.RequestLease_", id=t.int64)
 RequestPolicy = _struct("unitree_api.RequestPolicy_", priority=t.int32, noreply=bool)
 RequestHeader = _struct("unitree_api.RequestHeader_", identity=Identity, lease=Lease, policy=RequestPolicy)
-Request = _struct("unitree_api.Request_", header=RequestHeader, parameter=str, binary=t.sequence[t.uint8])
+Request = _struct("unitree_api.Request_", header=RequestHeader, parameter=str, binary=t.sequence[t.byte])
 Status = _struct("unitree_api.ResponseStatus_", code=t.int32)
 ResponseHeader = _struct("unitree_api.ResponseHeader_", identity=Identity, status=Status)
-Response = _struct("unitree_api.Response_", header=ResponseHeader, data=str, binary=t.sequence[t.uint8])
+Response = _struct("unitree_api.Response_", header=ResponseHeader, data=str, binary=t.sequence[t.byte])
 
 _TYPES = {COMMAND_TOPIC: LowCmd, STATE_TOPIC: LowState}
 
