@@ -58,6 +58,19 @@ LOW_STATE = np.dtype(
 # End of what stands before the first motor, in both forms.
 _BEFORE_MOTORS = {LOW_CMD: 2, LOW_STATE: 70}
 
+
+def _used(dtype: np.dtype) -> np.ndarray:
+    """Which bytes of a struct are not padding. bool [bytes]"""
+    if dtype.subdtype is not None:
+        element, shape = dtype.subdtype
+        return np.tile(_used(element), int(np.prod(shape)))
+    used = np.full(dtype.itemsize, dtype.fields is None)
+    for part, offset, *_ in (dtype.fields or {}).values():
+        used[offset : offset + part.itemsize] = _used(part)
+    return used
+
+
+_USED = {dtype: _used(dtype) for dtype in (LOW_CMD, LOW_STATE)}
 _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 # Bits of wireless_remote's bytes 2 and 3.
@@ -79,8 +92,9 @@ def crc32(words: bytes) -> int:
 
 def pack(message: np.ndarray) -> bytes:
     """A record of LOW_CMD or LOW_STATE as it goes onto the wire, CDR without its header; sets its CRC."""
-    message["crc"] = crc32(message.tobytes()[:-4])
-    struct, at = message.tobytes(), _BEFORE_MOTORS[message.dtype]
+    struct = _without_padding(message.tobytes(), message.dtype)
+    message["crc"] = crc = crc32(struct[:-4])
+    struct, at = struct[:-4] + crc.to_bytes(4, "little"), _BEFORE_MOTORS[message.dtype]
     return struct[:at] + struct[at + 2 : at + 3] + b"\0" + struct[at + 6 :]
 
 
@@ -90,8 +104,14 @@ def unpack(payload: bytes, dtype: np.dtype) -> np.ndarray | None:
         return None
     at = _BEFORE_MOTORS[dtype]
     struct = payload[:at] + b"\0\0" + payload[at : at + 1] + b"\0\0\0" + payload[at + 2 :]
+    struct = _without_padding(struct, dtype)
     message = np.frombuffer(struct, dtype)[0]
     return message if message["crc"] == crc32(struct[:-4]) else None
+
+
+def _without_padding(struct: bytes, dtype: np.dtype) -> bytes:
+    """A struct whose padding, which may be anything, is zero, as the CRC wants it."""
+    return (np.frombuffer(struct, np.uint8) * _USED[dtype]).tobytes()
 
 
 def pressed(remote: np.ndarray) -> frozenset[str]:
