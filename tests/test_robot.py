@@ -9,6 +9,8 @@ import re
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +26,7 @@ from hdmi.assets import g1 as figures
 from hdmi.deploy import g1, mocap, rotations
 from hdmi.deploy.description import Description, PolicyError
 from hdmi.deploy.line import Line
-from hdmi.deploy.log import Log
+from hdmi.deploy.log import Log, read_log
 from hdmi.deploy.policy import Policy
 from hdmi.deploy.robot import RobotError
 from hdmi.deploy.robots.unitree import Options, UnitreeRobot, connect
@@ -33,6 +35,7 @@ from hdmi.deploy.runner import Runner
 from hdmi.deploy.scene import hinge_of
 from hdmi.deploy.simulator import Options as SimulatorOptions
 from hdmi.deploy.simulator import Simulator
+from hdmi.deploy.trial import read_reference
 
 ROOT = Path(__file__).parents[1]
 NO_POSES = Options(mocap="none")
@@ -398,6 +401,58 @@ def test_nonsense_is_refused_in_one_line(about: Description, tmp_path: Path):
         UnitreeRobot(about, replace(NO_POSES, watchdog=0.0))
 
 
+class Wire:
+    """A port at whose other end a robot says the same all the time; keeps what it is sent."""
+
+    def __init__(self) -> None:
+        self.sent: list[bytes] = []
+        self.fault: Exception | None = None
+
+    def send(self, payload: bytes) -> None:
+        if self.fault is not None:
+            raise self.fault
+        self.sent.append(payload)
+
+    def receive(self, timeout: float) -> list[bytes]:
+        time.sleep(0.001)
+        return [state()]
+
+
+def waited(condition: Callable[[], object]) -> None:
+    """Returns when a condition holds that another thread brings about."""
+    for _ in range(2000):
+        if condition():
+            return
+        time.sleep(0.002)
+    raise AssertionError("in vain")
+
+
+def test_damping_is_the_last_that_is_sent(about: Description):
+    wire, robot = Wire(), UnitreeRobot(about, replace(NO_POSES, farewell=0.05, watchdog=60.0))
+    robot.listen(wire)
+    robot.drive(wire)
+    robot.command(np.zeros(29), np.ones(29), np.ones(29))
+    waited(lambda: wire.sent and commanded(wire.sent[-1])["kp"].any())
+    before = len(wire.sent)
+    robot.close()
+    farewell = [commanded(payload)["kp"].any() for payload in wire.sent[before + 2 :]]  # one may have been under way
+    assert farewell
+    assert not any(farewell)
+    assert not any(thread.is_alive() for thread in robot._threads)
+    robot.close()
+
+
+def test_a_wire_that_breaks_loses_the_robot(about: Description):
+    wire, robot = Wire(), UnitreeRobot(about, NO_POSES)
+    robot.listen(wire)
+    wire.fault = RobotError("rt/lowcmd: DDS does not take a message")
+    robot.drive(wire)
+    waited(lambda: robot._failure)
+    with pytest.raises(RobotError, match="the robot is lost: rt/lowcmd: DDS does not take a message"):
+        robot.read()
+    robot.close()
+
+
 def test_a_line_delays_and_loses():
     line = Line[int](0.1, 0.5, np.random.default_rng(0))
     for i in range(100):
@@ -619,6 +674,19 @@ def received(port: Any, send: Callable[[], None]) -> bytes:
     raise AssertionError("nothing arrives")
 
 
+def repeatedly(action: Callable[[], object]) -> tuple[threading.Event, threading.Thread]:
+    """Does something in another thread, again and again until the event is set."""
+    done = threading.Event()
+
+    def work() -> None:
+        while not done.wait(0.005):
+            action()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    return done, thread
+
+
 @DDS
 def test_messages_cross_dds(bus: Any):
     from hdmi.deploy import dds
@@ -630,24 +698,30 @@ def test_messages_cross_dds(bus: Any):
         payload = g1.pack(message)
         assert g1.unpack(received(far, lambda near=near, payload=payload: near.send(payload)), dtype) == message
     assert not dds.others_command(bus, 0.05)  # this participant itself does not count
+    from cyclonedds.domain import DomainParticipant
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.topic import Topic
+
+    other = DomainParticipant(DOMAIN)
+    message = object.__new__(dds.LowCmd)
+    message.payload = g1.pack(filled(g1.LOW_CMD))
+    writer = DataWriter(other, Topic(other, g1.COMMAND_TOPIC, dds.LowCmd))
+    done, thread = repeatedly(lambda: writer.write(message))
+    try:
+        assert dds.others_command(bus, 5.0)
+    finally:
+        done.set()
+        thread.join()
 
 
 @DDS
 def test_the_robots_own_service_is_released(bus: Any):
-    import threading
-
     from hdmi.deploy.motion_switcher import MotionSwitcher, SimulatedSwitcher
 
     with pytest.raises(RobotError, match=r"the motion switcher does not answer within 0.2 s; press L2 and R2"):
         MotionSwitcher(bus).release(0.2)
-    switcher, done = SimulatedSwitcher(bus, "ai"), threading.Event()
-
-    def serve() -> None:
-        while not done.wait(0.005):
-            switcher.answer()
-
-    thread = threading.Thread(target=serve)
-    thread.start()
+    switcher = SimulatedSwitcher(bus, "ai")
+    done, thread = repeatedly(switcher.answer)
     try:
         MotionSwitcher(bus).release(5.0)
     finally:
@@ -766,9 +840,21 @@ def test_a_whole_policy_over_a_bad_network(tmp_path: Path, processes: list[subpr
     processes.append(robot)
     until(robot, "at the start of lift_box")
     runner = start(
-        "deploy", f"policy={tmp_path}", "robot=unitree", "interface=lo", domain, f"mocap={poses}", "auto=true"
+        "deploy",
+        f"policy={tmp_path}",
+        "robot=unitree",
+        "interface=lo",
+        domain,
+        f"mocap={poses}",
+        "auto=true",
+        f"log={tmp_path / 'log.npz'}",
     )
     processes.append(runner)
     said, errors = runner.communicate(timeout=120)
     assert runner.returncode == 0, errors
     assert "hold -> damping: the motion is over" in said
+    _, rows = read_log(tmp_path / "log.npz")
+    ran = rows["frame"] >= 0
+    wanted = read_reference(tmp_path, Policy(tmp_path).description)["object_pos_w"][rows["frame"][ran]]
+    assert np.ptp(wanted[:, 2]) > 0.1  # it is lifted
+    assert np.linalg.norm(rows["sensors/object_pos_w"][ran] - wanted, axis=1).mean() < 0.08

@@ -1,7 +1,7 @@
 """Runs an exported policy on a robot, real or simulated, without the trainer: needs neither torch nor hydra.
 
     hdmi deploy policy=FOLDER robot=mujoco [episodes=50] [log=FILE.npz] [plot=FILE.png] ...
-    hdmi deploy policy=FOLDER robot=NAME auto=false log=FILE.npz  # keys: s to the start, r run, h hold, space damping
+    hdmi deploy policy=FOLDER robot=unitree interface=eth0 log=FILE.npz  # keys: s start, r run, h hold, space damping
     hdmi deploy policy=FOLDER replay=FILE.npz [plot=FILE.png]         # the graph over logged sensors
 
 With `episodes`, a simulated robot begins each episode at the perturbed first frame, and a table shows success, errors

@@ -281,9 +281,9 @@ def connect(description: Description, folder: Path, options: Options) -> Unitree
     if options.interface is None:
         raise RobotError("give interface=NAME, the network interface of the robot, such as eth0; lo for simulate_robot")
     robot = UnitreeRobot(description, options, _hinge(folder / SCENE_FILE))
-    poses = None if robot.motion is None else mocap.socket_of("SUB", options.mocap, "mocap")
     bus = dds.Bus(options.interface, options.domain)
     port = dds.Port(bus, g1.COMMAND_TOPIC, g1.STATE_TOPIC)
+    poses = None if robot.motion is None else mocap.socket_of("SUB", options.mocap, "mocap")
     try:
         robot.listen(port, poses)
         if options.release:
