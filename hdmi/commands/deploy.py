@@ -100,6 +100,8 @@ def _drive(options: Options, values: dict[type, Any], policy: Policy, robot: Any
     finally:
         for source in controls:
             source.close()
+        for remark in robot.remarks():
+            print(remark, file=sys.stderr)
     console.print(_counts(drive), markup=False)
     _finish(options, drive, policy)
     if drive.failure is not None:

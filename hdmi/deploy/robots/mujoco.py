@@ -329,6 +329,9 @@ class MujocoRobot:
         zero = np.zeros(len(self._servos))
         self.servo(zero, zero, self.description.damping)
 
+    def remarks(self) -> tuple[str, ...]:
+        return ()
+
     def close(self) -> None:
         self.damp()
         if self._viewer is not None:

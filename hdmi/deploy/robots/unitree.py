@@ -252,6 +252,12 @@ class UnitreeRobot:
     def damp(self) -> None:
         self._command = None
 
+    def remarks(self) -> tuple[str, ...]:
+        found = [f"{self.dropped} states with a wrong CRC dropped"] if self.dropped else []
+        if self.motion is not None and self.motion.dropped:
+            found.append(f"{self.motion.dropped} messages of motion capture dropped, the last: {self.motion.reason}")
+        return tuple(found)
+
     def close(self) -> None:
         self.damp()
         if self._leave_at is None:
