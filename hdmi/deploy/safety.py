@@ -19,7 +19,7 @@ ALWAYS = ("joint_pos", "joint_vel", "root_quat_w")  # what limits need, whatever
 class Limits:
     """Where a runner limits, and where it gives up and damps."""
 
-    target_margin: float = 0.0  # rad that targets keep off the ends of the joint ranges
+    target_margin: float | None = None  # rad that targets keep off the ends of the joint ranges, if they are to
     range_margin: float = 0.1  # rad beyond the range at which a measured joint means damping
     velocity: float = 1.0  # share of the motors' velocity limits at which a measured speed means damping
     effort: float = 1.0  # share of the effort limits that a target may ask for; 0 leaves the limit to the motors
@@ -59,8 +59,9 @@ class Guard:
     def __init__(self, description: Description, sensors: Iterable[str], limits: Limits):
         self.description, self.limits = description, limits
         self.needed = tuple(dict.fromkeys((*ALWAYS, *sensors)))
-        self.low = description.joint_ranges[:, 0] + limits.target_margin
-        self.high = description.joint_ranges[:, 1] - limits.target_margin
+        # soft servos are sent beyond a range to get torque within it, which `effort` limits
+        margin = -np.inf if limits.target_margin is None else limits.target_margin
+        self.low, self.high = description.joint_ranges[:, 0] + margin, description.joint_ranges[:, 1] - margin
         self.counts = Counts()
         self.ages: dict[str, float] = {}
         self._last: dict[str, np.ndarray] = {}
@@ -144,7 +145,7 @@ class Guard:
     def limit(
         self, target: np.ndarray, stiffness: np.ndarray, damping: np.ndarray, sensors: dict[str, np.ndarray]
     ) -> np.ndarray:
-        """A target within the joint ranges that asks for no more torque than the motors have. rad [J]
+        """A target within the joint ranges, if these are limits, that asks for no more torque than the motors have. rad [J]
 
         The torque is that of the servo at the measured state, `kp (target - q) - kd qd`.
         """
