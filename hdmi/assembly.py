@@ -261,6 +261,7 @@ def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
         "robot_bodies": task.scene.body_ids.tolist(),
         "effectors": task.scene.effectors,
         "object_geoms": task.scene.object_geoms,
+        "object_free": task.scene.object_free_dof is not None,
         "control_dt": task.scene.sim.control_dt,
         "decimation": task.scene.sim.decimation,
     }

@@ -39,8 +39,6 @@ class ScriptedEnv(EnvBase):
         episode_steps: steps after which an episode terminates; None for never.
         truncates: whether there is a `truncated` entry.
         done_group: under which the three are; at the top if None.
-
-    What the latest reset was given is kept in `asked`.
     """
 
     batch_locked = True
@@ -69,7 +67,6 @@ class ScriptedEnv(EnvBase):
         self.full_reward_spec = Composite({reward_key: Unbounded(shape=(n, 1))}, shape=(n,))
         names = ("done", "terminated", "truncated") if truncates else ("done", "terminated")
         self.done_names = [name if done_group is None else (done_group, name) for name in names]
-        self.asked: TensorDictBase | None = None
         self.full_done_spec = Composite(
             {key: Binary(n=1, shape=(n, 1), dtype=torch.bool) for key in self.done_names}, shape=(n,)
         )
@@ -95,7 +92,6 @@ class ScriptedEnv(EnvBase):
         return out
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
-        self.asked = tensordict
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.reshape(self.batch_size)
         self.counter = torch.where(mask, 0, self.counter)
@@ -117,6 +113,8 @@ SHAPES: dict[NestedKey, tuple[int, ...]] = {
     ("robot", "body_ang_vel"): (30, 3),
     ("robot", "root_pos"): (3,),
     ("robot", "root_quat"): (4,),
+    ("robot", "root_lin_vel"): (3,),
+    ("robot", "root_ang_vel"): (3,),
     ("robot", "foot_force"): (2, 3),
     ("object", "pos"): (3,),
     ("object", "quat"): (4,),

@@ -15,9 +15,10 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from hdmi.assembly import describe, make_env, make_task, make_transforms
+from hdmi.assembly import describe, make_env, make_task, make_transforms, scene_parts
 from hdmi.config import ConfigError, build
 from hdmi.motion import MotionError
+from hdmi.transforms import SpringAssist
 
 ABLATIONS = sorted(path.stem for path in (CONF / "ablation").glob("*.yaml"))
 
@@ -141,6 +142,71 @@ class TestAblations:
             line.split("_target_:")[1].split(",")[0].strip(" }") for line in text.splitlines() if "_target_:" in line
         ]
         assert all(target.startswith(("hdmi.", "torchrl.")) for target in targets)
+
+
+LEVERS = sorted(path.stem for path in (CONF / "lever").glob("*.yaml"))
+# nodes that a lever adds, those that it takes out, and those that it changes
+CHANGED_BY_LEVER: dict[str, tuple[set[str], set[str], set[str]]] = {
+    "early_end": ({"early_end.early_root_pose", "early_end.early_body_pose"}, set(), set()),
+    "feedforward": ({"reference.target"}, set(), {"action.target"}),
+    "privileged": (
+        set(),
+        {f"noise.{name}" for name in ("root_ang_vel", "gravity", "joint_pos", "object_position", "object_heading")}
+        | {"noise.contact_points", "noise.contact_points_episode"},
+        {"input.policy"},
+    ),
+    "rewind": ({"reset.rewind"}, set(), set()),
+    "root_history": ({"noise.root_reference", "history.root_reference"}, set(), set()),
+    "springs": ({"assist.root"}, set(), set()),
+    "springs_object": ({"assist.object"}, set(), set()),
+}
+
+
+class TestLevers:
+    def test_all_are_expected(self):
+        assert set(LEVERS) == set(CHANGED_BY_LEVER)
+
+    @pytest.mark.parametrize("name", LEVERS)
+    def test_changes_exactly_its_nodes(self, name):
+        default, pulled = stack_of(), stack_of(f"+lever={name}")
+        added, gone, changed = CHANGED_BY_LEVER[name]
+        assert set(pulled) - set(default) == added
+        assert set(default) - set(pulled) == gone
+        assert [node for node in pulled if node not in added] == [node for node in default if node not in gone]
+        assert {node for node in default if node in pulled and pulled[node] != default[node]} == changed
+        before, after = load_config(), load_config(f"+lever={name}")
+        stack = {node.partition(".")[0] for node in added | gone | changed}
+        assert {key for key in before if before[key] != after[key]} == stack
+
+    def test_what_the_policy_sees_of_them(self):
+        widths = {
+            name: env_of(*overrides).observation_spec["policy"].shape[-1]
+            for name, overrides in (("plain", ()), ("root", ("+lever=root_history",)), ("all", ("+lever=privileged",)))
+        }
+        assert widths["root"] - widths["plain"] == 3 * 9
+        assert widths["all"] > env_of().observation_spec["critic"].shape[-1] > widths["plain"]  # with its histories
+        step = env_of("+lever=privileged").reset()
+        assert set(step["critic"][0].tolist()) <= set(step["policy"][0].tolist())
+
+    def test_steps_with_all_that_go_together(self):
+        env = env_of(f"+lever=[{','.join(name for name in LEVERS if name != 'privileged')}]", "total_frames=80")
+        check_env_specs(env)
+        torch.manual_seed(0)
+        rollout = env.rollout(30, break_when_any_done=False)
+        assert rollout["next", "reward"].isfinite().all()
+        springs = [t for t in env.transform if isinstance(t, SpringAssist)]
+        assert [float(spring.strength) for spring in springs] == [0.0, 0.0]  # 40 steps each, of which half are left
+
+
+def test_gains_of_the_deployment():
+    robot = scene_parts(load_config("task=walk", "robot=g1_deploy"))["robot"].robot
+    of = dict(zip(robot.joint_names, zip(robot.stiffness, robot.damping, strict=True), strict=True))
+    assert of["left_hip_yaw_joint"] == of["right_hip_pitch_joint"] == (100, 2)
+    assert of["right_knee_joint"] == of["waist_roll_joint"] == (200, 4)
+    assert of["left_ankle_roll_joint"] == (20, 0.2)
+    assert of["left_elbow_joint"] == of["right_shoulder_yaw_joint"] == (40, 5)
+    assert of["left_wrist_pitch_joint"] == (4, 0.5)
+    assert set(of.values()) == {(100, 2), (200, 4), (20, 0.2), (40, 5), (4, 0.5)}  # every joint has one of these
 
 
 class TestMistakes:

@@ -120,10 +120,14 @@ def test_graph_gives_the_trainers_targets(name: str, task_of):
     assert follow(env, actor, graph, in_torch(graph), middle) < 1e-5
 
 
-@pytest.mark.parametrize("name", ["walk", "push_door_hand"])
-def test_exported_graph_gives_the_trainers_targets(name: str, task_of):
-    """Robot alone, and articulated."""
-    cfg = quiet(load_config(f"task={name}"))
+@pytest.mark.parametrize(
+    "overrides",
+    [["task=walk"], ["task=push_door_hand"], ["task=lift_box", "+lever=[feedforward,root_history]"]],
+    ids=" ".join,
+)
+def test_exported_graph_gives_the_trainers_targets(overrides: list[str], task_of):
+    """Robot alone, articulated, and with actions that start from what is computed of the reference."""
+    cfg = quiet(load_config(*overrides))
     task = task_of(cfg)
     env = make_env(cfg, 1, task)
     actor = untrained(env)
@@ -147,6 +151,14 @@ class TestLiftBox:
         assert [name for name, _ in graph.inverse] == ["action.joint_position", "action.target"]
         assert "tracking.contact_points" in nodes
         assert "tracking.bodies" not in nodes
+
+    def test_aids_of_training_stay_behind(self, task_of):
+        cfg = load_config("+lever=[early_end,springs,springs_object,rewind,feedforward]")
+        task = task_of(cfg)
+        graph, _ = make_graph(cfg, untrained(make_env(cfg, 1, task)), task)
+        nodes = {name for name, _ in (*graph.stages, *graph.inverse)}
+        assert {"reference.motion", "reference.target", "action.target"} <= nodes
+        assert not [name for name in nodes if name.startswith(("assist", "early_end", "reset"))]
 
     def test_state_is_what_the_next_tick_reads(self, parts):
         _, graph, _ = parts

@@ -16,8 +16,9 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs import transforms as tt
 
 from hdmi.assembly import make_env
+from hdmi.assets import ObjectConfig, RobotConfig, Scene, SimConfig, build_scene
 from hdmi.config import ConfigError
-from hdmi.envs import BatchBackend, MaskedResetEnv, ResetEnv, RowResetEnv
+from hdmi.envs import BatchBackend, HumanoidObjectEnv, MaskedResetEnv, ResetEnv, RowResetEnv
 from hdmi.learning.collectors import WorldCollector
 
 DETERMINISTIC = ("+ablation=no_randomization", "reset.state.start=first", "~reset.state.noise")
@@ -84,6 +85,81 @@ class TestBackend:
         for runs in ([[0, 0, 0, 0], [1, 1, 1, 1]], [[0, 0, 0, 2], [1, 3, 3, 3]], [[2, 2, 2, 2], [3, 2, 3, 2]]):
             backend.step(targets[torch.tensor(runs)])
         assert written == [[1]]
+
+
+class TestWrench:
+    """Forces on the root and on an object, a cube of 2 kg whose centre is 0.3 m beside its origin; both in the air."""
+
+    DT, MASS, INERTIA = 0.02, 2.0, 2 / 3 * 2.0 * 0.1**2  # s, kg, kg m^2
+    GRAVITY = torch.tensor([0.0, 0.0, -9.81])
+
+    @pytest.fixture(scope="class")
+    def scene(self) -> Scene:
+        cube = ObjectConfig("cube", [{"box": (0.1, 0.1, 0.1), "pos": (0.3, 0.0, 0.0)}], mass=self.MASS)
+        return build_scene(RobotConfig(), SimConfig(), cube)
+
+    def reset(self, env: HumanoidObjectEnv) -> TensorDictBase:
+        init = {"root_pos": torch.tensor([0.0, 0.0, 5.0]), "object_pos": torch.tensor([3.0, 0.0, 5.0])}
+        init = {key: value.expand(env.num_envs, 3) for key, value in init.items()}
+        return env.reset(TensorDict({"init": init}, batch_size=[env.num_envs]))
+
+    def start(self, scene: Scene, count: int = 2) -> tuple[HumanoidObjectEnv, TensorDictBase]:
+        env = HumanoidObjectEnv(scene, count, lambda m, n: BatchBackend(m, n, 1))
+        return env, self.reset(env)
+
+    def step(self, env: HumanoidObjectEnv, state: TensorDictBase, **wrench: list[list[float]]) -> TensorDictBase:
+        given = state.select("robot", "object").set("action", state["robot", "joint_pos"])
+        for name, rows in wrench.items():
+            given["wrench", name] = torch.tensor(rows)
+        return env.step(given)["next"]
+
+    def test_force_and_moment_are_about_the_origin_of_the_object(self, scene):
+        env, state = self.start(scene, 4)
+        force, moment = 0.4, 0.3 * 0.4  # the force at the origin turns the cube as this moment does
+        rows = [
+            [0, 0, force, 0, 0, 0],
+            [0, 0, force, 0, -moment, 0],
+            [0, 0, 0, 0, 0, 0.05],
+            [0, 0, 0, 0, 0, 0],
+        ]
+        after = self.step(env, state, object=rows)["object"]
+        turn = self.DT / self.INERTIA * torch.tensor([[0, moment, 0], [0, 0, 0], [0, 0, 0.05], [0, 0, 0]])
+        torch.testing.assert_close(after["ang_vel"], turn, atol=2e-3, rtol=0)
+        fall = self.DT * (self.GRAVITY + torch.tensor([[0, 0, force / self.MASS]] * 2 + [[0, 0, 0.0]] * 2))
+        # of the origin, which goes round the centre
+        swing = torch.linalg.cross(turn, torch.tensor([[-0.3, 0, 0]] * 4))
+        torch.testing.assert_close(after["lin_vel"], fall + swing, atol=2e-3, rtol=0)
+
+    def test_force_on_the_root_moves_the_robot(self, scene):
+        env, state = self.start(scene)
+        self.step(env, state, root=[[30.0, -20.0, 10.0, 0, 0, 0], [0.0] * 6])
+        momentum = []
+        for index in range(2):
+            model, data = env.backend.world(index)
+            mujoco.mj_subtreeVel(model, data)
+            root = int(scene.body_ids[0])
+            momentum.append(torch.from_numpy(data.subtree_linvel[root] * model.body_subtreemass[root]).float())
+        change = momentum[0] - momentum[1]
+        torch.testing.assert_close(change, self.DT * torch.tensor([30.0, -20.0, 10.0]), atol=2e-2, rtol=0)
+
+    @pytest.mark.parametrize("reset", [False, True])
+    def test_ends_with_the_step(self, scene, reset):
+        """Then the cube falls freely, after a reset and without one."""
+        env, state = self.start(scene)
+        along = [[50.0, 0, 0, 0, 0, 0]] * 2  # through the cube's centre
+        state = self.step(env, state, object=along, root=along)
+        gained = self.DT * torch.tensor([50 / self.MASS, 0, -9.81])
+        torch.testing.assert_close(state["object", "lin_vel"], gained.expand(2, 3), atol=1e-3, rtol=0)
+        before = state["object", "lin_vel"]
+        if reset:
+            state, before = self.reset(env), torch.zeros(2, 3)
+        after = self.step(env, state)["object", "lin_vel"]
+        torch.testing.assert_close(after - before, (self.DT * self.GRAVITY).expand(2, 3), atol=1e-3, rtol=0)
+
+    def test_no_wrench_is_none(self, scene):
+        (env, state), (other, same) = self.start(scene), self.start(scene)
+        pulled = self.step(env, state, object=[[0.0] * 6] * 2, root=[[0.0] * 6] * 2)
+        assert_same(pulled, self.step(other, same))
 
 
 def advance(env: TransformedEnv, tensordict: TensorDictBase, steps: int) -> TensorDictBase:

@@ -15,7 +15,7 @@ from mocks import command, lift_box, load_config
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 
-from hdmi.assembly import make_env
+from hdmi.assembly import make_env, make_transforms
 from hdmi.assets import g1
 from hdmi.config import ConfigError
 from hdmi.envs.rendering import RenderingError, WorldRenderer
@@ -166,6 +166,21 @@ def test_the_protocol_starts_at_the_first_frame_and_keeps_what_was_trained():
     for group in ("randomization", "noise", "termination", "observation", "action"):
         assert cfg[group] == trained[group]
     assert "bins" in trained.reset.state
+
+
+def test_the_protocol_is_without_the_aids_of_training():
+    trained = load_config("+lever=[early_end,springs,springs_object,rewind,feedforward]")
+    cfg = evaluation_config(trained)
+    assert set(cfg.reset) == {"state"}
+    assert cfg.early_end == cfg.assist == {}
+    assert cfg.action == trained.action  # what the policy's actions mean stays
+    assert cfg.reference == trained.reference
+    assert termination_names(cfg) == termination_names(load_config())
+    nodes = dict(make_transforms(cfg, lift_box()))
+    assert not [name for name in nodes if name.startswith(("early_end", "assist")) or name == "reset.rewind"]
+    assert "reference.target" in nodes
+    assert set(trained.assist) == {"root", "object"}  # the config that was given is as it was
+    assert "rewind" in trained.reset
 
 
 def test_terminations_can_be_chosen():

@@ -15,6 +15,7 @@ from hdmi.functional import (
     body_velocity,
     contact_lost,
     error_exceeds,
+    feedforward_target,
     feet_air_time,
     feet_impact,
     feet_slip,
@@ -27,6 +28,7 @@ from hdmi.functional import (
     quat_apply,
     quat_from_euler,
     quat_multiply,
+    spring_wrench,
     sum_of_squares,
     tracking,
     tracking_mean,
@@ -258,3 +260,50 @@ def test_body_velocity_agrees_with_mujoco(robot_scene):
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, expected, 0)
         close(ang[row], expected[:3], atol=1e-9)
         close(lin[row], expected[3:], atol=1e-9)
+
+
+class TestFeedForwardTarget:
+    kp, kd, limit = torch.tensor([100.0, 50.0]), torch.tensor([2.0, 5.0]), torch.tensor([30.0, 40.0])
+
+    def test_by_hand(self):
+        pos, vel = torch.tensor([[0.5, -0.2], [0.0, 0.0]]), torch.tensor([[1.0, -2.0], [0.0, 0.0]])
+        torque = torch.tensor([[10.0, -20.0], [90.0, -90.0]])
+        # 0.5 + (10 + 2) / 100; -0.2 + (-20 - 10) / 50; 30 / 100; -40 / 50
+        close(feedforward_target(pos, vel, torque, self.kp, self.kd, self.limit), [[0.62, -0.8], [0.3, -0.8]])
+
+    def test_a_servo_on_the_motion_gives_the_torque(self):
+        torch.manual_seed(0)
+        pos, vel, torque = torch.randn(3, 7, 2)
+        target = feedforward_target(pos, vel, torque, self.kp, self.kd, self.limit)
+        close(self.kp * (target - pos) - self.kd * vel, torque, 1e-4)
+
+
+class TestSpringWrench:
+    def pull(self, mass: Tensor | float = 4.0, **away: list[float]) -> Tensor:
+        terms = ("offset", "rotation", "lin_vel", "ang_vel")
+        given = {name: torch.tensor(away.get(name, [0.0, 0.0, 0.0])) for name in terms}
+        return spring_wrench(**given, mass=mass, radius=0.5, rate=3.0)
+
+    def test_by_hand(self):
+        close(self.pull(), torch.zeros(6))
+        close(self.pull(offset=[0.1, 0.0, -0.2]), [3.6, 0, -7.2, 0, 0, 0])  # 4 kg times 9 / s^2
+        close(self.pull(lin_vel=[0.0, 0.5, 0.0]), [0, 12, 0, 0, 0, 0])  # 4 kg times 6 / s
+        close(self.pull(rotation=[0.2, 0.0, 0.0]), [0, 0, 0, 1.8, 0, 0])  # 1 kg m^2 times 9 / s^2
+        close(self.pull(ang_vel=[0.0, 0.0, -1.0]), [0, 0, 0, 0, 0, -6])
+
+    def test_a_mass_for_each_world(self):
+        mass = torch.tensor([[1.0], [2.0]])
+        close(self.pull(mass, offset=[0.1, 0.0, 0.0], ang_vel=[0.0, 1.0, 0.0])[:, [0, 4]], [[0.9, 1.5], [1.8, 3.0]])
+
+    def test_is_critically_damped(self):
+        """A mass on it arrives as (1 + w t) exp(-w t) says, without going beyond."""
+        gap, speed, dt, still = torch.tensor([1.0, 0.0, 0.0]), torch.zeros(3), 1e-3, torch.zeros(3)
+        gaps = []
+        for _ in range(3000):
+            force = spring_wrench(gap, still, -speed, still, mass=2.0, radius=1.0, rate=3.0)[:3]
+            speed = speed + force / 2.0 * dt
+            gap = gap - speed * dt
+            gaps.append(float(gap[0]))
+        time = dt * torch.arange(1, 3001)
+        close(torch.tensor(gaps), (1 + 3 * time) * torch.exp(-3 * time), 2e-3)
+        assert min(gaps) > 0

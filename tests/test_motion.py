@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from hdmi.assets import Effector, HingeConfig, ObjectConfig, SceneryConfig, g1, g1_robot
+from hdmi.assets import Effector, HingeConfig, ObjectConfig, RobotConfig, SceneryConfig, g1, g1_robot
 from hdmi.motion import MotionError, find_motion, forward_kinematics, load_motion, make_reference, save_motion
 from hdmi.motion.complete import resample
 from hdmi.motion.kinematics import angular_velocity, derivative
@@ -66,8 +66,9 @@ class TestFormat:
         rng = np.random.default_rng(0)
         quat = rng.normal(size=(T, 4, 4))
         quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
-        points = rng.normal(size=(T, 1, 3))
-        first = load_motion(write_motion(body_quat_w=quat.astype(np.float32), contact_points=points))
+        more = {"contact_points": rng.normal(size=(T, 1, 3)), "joint_target": rng.normal(size=(T, 2))}
+        first = load_motion(write_motion(body_quat_w=quat.astype(np.float32), **more))
+        np.testing.assert_allclose(first.joint_target, more["joint_target"], rtol=1e-6)
         folder = save_motion(first, tmp_path / "again" / "stroll")
         second = load_motion(folder)
         for key, value in vars(first).items():
@@ -78,8 +79,8 @@ class TestFormat:
                 assert getattr(second, key) == value, key
 
     def test_round_trip_without_labels(self, write_motion, tmp_path):
-        first = load_motion(write_motion(drop=["object_contact"]))
-        assert load_motion(save_motion(first, tmp_path / "again")).object_contact is None
+        again = load_motion(save_motion(load_motion(write_motion(drop=["object_contact"])), tmp_path / "again"))
+        assert again.object_contact is again.contact_points is again.joint_target is None
 
     @pytest.mark.parametrize("labels", [np.ones(T), np.ones((T, 1), np.int64), np.ones((T, 1), bool)])
     def test_labels_of_one_column(self, write_motion, labels):
@@ -172,6 +173,9 @@ class TestErrors:
             ("object_contact", ()),
             ("contact_points", (T, 2, 2)),
             ("contact_points", (T, 3)),
+            ("joint_target", (T, 3)),
+            ("joint_target", (T - 1, 2)),
+            ("joint_target", (T,)),
         ],
     )
     def test_wrong_shape(self, write_motion, key, shape):
@@ -232,6 +236,12 @@ class TestResample:
         assert odd.num_frames == 13  # 0.4 s
         np.testing.assert_allclose(odd.body_pos_w[:, 3, 1], 0.2 * np.arange(13) / 30, atol=1e-6)
 
+    def test_joint_targets_are_interpolated(self, write_motion, motion_arrays):
+        target = motion_arrays["joint_pos"] + 0.1
+        double = resample(load_motion(write_motion(joint_target=target)), 100.0)
+        np.testing.assert_allclose(double.joint_target, double.joint_pos + 0.1, atol=1e-6)
+        assert resample(load_motion(write_motion("plain")), 100.0).joint_target is None
+
     def test_same_rate_changes_nothing(self, write_motion):
         motion = load_motion(write_motion())
         assert resample(motion, FPS) is motion
@@ -269,6 +279,27 @@ class TestReference:
         np.testing.assert_allclose(column["right_knee_joint"], 0.669, atol=1e-6)
         np.testing.assert_allclose(column["left_wrist_roll_joint"], 0.0)
         assert not reference.joint_vel[:, g1.JOINT_NAMES.index("right_knee_joint")].any()
+
+    def test_joint_targets_are_completed_like_joints(self, write_motion, motion_arrays):
+        target = motion_arrays["joint_pos"] + np.float32(0.1)
+        folder = write_motion(joint_target=target)
+        reference = make_reference(folder, control_dt=0.02)
+        assert (reference.joint_target.shape, reference.joint_target.dtype) == ((T, 29), torch.float32)
+        column = dict(zip(g1.JOINT_NAMES, reference.joint_target.T, strict=True))
+        np.testing.assert_array_equal(column["left_knee_joint"], target[:, 0])
+        np.testing.assert_array_equal(column["waist_yaw_joint"], target[:, 1])
+        np.testing.assert_allclose(column["right_knee_joint"], 0.669, atol=1e-6)  # absent: the default pose
+        robot = RobotConfig(default_pose={"waist_yaw_joint": -0.3}, held=["waist_yaw_joint"])
+        held = make_reference(folder, control_dt=0.02, robot=robot).joint_target
+        np.testing.assert_allclose(held[:, g1.JOINT_NAMES.index("waist_yaw_joint")], -0.3)
+        np.testing.assert_array_equal(held[:, g1.JOINT_NAMES.index("left_knee_joint")], target[:, 0])
+        assert make_reference(write_motion("plain"), control_dt=0.02).joint_target is None
+
+    def test_joint_targets_go_with_their_joints(self, write_motion, motion_arrays):
+        target = motion_arrays["joint_pos"] + np.float32(0.1)
+        kept = load_motion(write_motion(joint_target=target)).with_joints(["waist_yaw_joint", "right_knee_joint"])
+        assert kept.joint_names == ("waist_yaw_joint",)
+        np.testing.assert_array_equal(kept.joint_target, target[:, 1:])
 
     def test_bodies_that_the_motion_lacks_come_from_forward_kinematics(self, write_motion, motion_arrays):
         reference = make_reference(write_motion(), control_dt=0.02)

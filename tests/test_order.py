@@ -14,7 +14,7 @@ from hdmi.config import ConfigError, task_files
 from hdmi.envs import HumanoidObjectEnv
 from hdmi.order import RULES, Stack, check_order, check_reads
 
-ABLATIONS = sorted(path.stem for path in (CONF / "ablation").glob("*.yaml"))
+ABLATIONS, LEVERS = (sorted(path.stem for path in (CONF / group).glob("*.yaml")) for group in ("ablation", "lever"))
 
 
 def term(name: str, key: str = "speed") -> T.RewardTerm:
@@ -54,6 +54,7 @@ def policy(*keys: str) -> Transform:
 WRONG: dict[str, tuple[Transform, Transform, str]] = {
     "size": (T.ObjectScale([0.9, 1.1]), starts(), "starts have to know the size"),
     "adaptive": (T.ObjectScale([0.9, 1.1]), starts(adaptive=True), "starts have to know the size"),
+    "rewind": (T.Rewind(), starts(), "starts have to know the frame"),
     "worlds": (mass("box", "world"), mass("pelvis", "episode"), "untouched model"),
     "delay": (T.ActionSmoothing(), T.ActionDelay([1, 2], 4), "the last thing that happens to a target"),
     "late offsets": (T.ResidualAction(), T.ActionDelay([1, 2], 4), "targets that are delayed"),
@@ -201,11 +202,23 @@ def test_variants_that_ship_pass(overrides: list[str]):
 @pytest.mark.parametrize("name", task_files())
 def test_tasks_pass(name: str, monkeypatch: pytest.MonkeyPatch):
     """Alone, and with everything that may be added."""
-    monkeypatch.setattr("hdmi.assembly.start_tables", lambda *_: None)  # seconds, and no node depends on them
+    # seconds, and no node depends on them
+    monkeypatch.setattr("hdmi.assembly.start_tables", lambda *_: None)
+    monkeypatch.setattr("hdmi.assembly.reference_torque", lambda _, reference: reference.joint_pos.numpy())
     task = make_task(load_config(f"task={name}"))
     base = HumanoidObjectEnv(task.scene, 1)
-    for more in ([], ["reset=adaptive", "randomization=hdmi_push", "reward=hdmi_survival"]):
+    levers = [lever for lever in LEVERS if lever != "springs_object" or task.scene.object_free_dof is not None]
+    added = ["reset=adaptive", "randomization=hdmi_push", "reward=hdmi_survival", f"+lever=[{','.join(levers)}]"]
+    for more in ([], added):
         check_reads(make_transforms(load_config(f"task={name}", *more), task), base)
+
+
+@pytest.mark.parametrize("name", ["walk", "push_door_hand"])
+def test_springs_pull_no_object_that_cannot_move(name: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("hdmi.assembly.start_tables", lambda *_: None)
+    cfg = load_config(f"task={name}", "+lever=springs_object")
+    with pytest.raises(ConfigError, match=rf"assist\.object: .*motion '{name}' has no object that can be pulled"):
+        make_transforms(cfg, make_task(cfg))
 
 
 def test_a_task_may_add_terms_of_its_own():

@@ -19,6 +19,7 @@ from hdmi.functional import (
     quat_from_euler,
     quat_multiply,
     quat_to_rot6d,
+    quat_to_rotation_vector,
     yaw_quat,
 )
 
@@ -186,6 +187,50 @@ def test_rot6d_is_the_first_two_columns(q):
     close(quat_to_rot6d(-q), quat_to_rot6d(q))
 
 
+def test_rotation_vectors_of_known_rotations():
+    close(quat_to_rotation_vector(IDENTITY), [0.0, 0.0, 0.0])
+    close(quat_to_rotation_vector(-IDENTITY), [0.0, 0.0, 0.0])
+    close(quat_to_rotation_vector(QUARTER_Y), [0.0, math.pi / 2, 0.0])
+    # three quarters of a turn to the left are one to the right
+    three_quarters = quat_from_axis_angle(Z, torch.tensor(1.5 * math.pi, dtype=torch.float64))
+    close(quat_to_rotation_vector(three_quarters), [0.0, 0.0, -math.pi / 2])
+
+
+@given(axes, angles)
+def test_rotation_vector_undoes_axis_angle_whatever_the_sign(axis, angle):
+    q = quat_from_axis_angle(axis, torch.tensor(angle, dtype=torch.float64))
+    close(quat_to_rotation_vector(q), angle * axis, atol=1e-7)
+    close(quat_to_rotation_vector(-q), angle * axis, atol=1e-7)
+
+
+@pytest.mark.parametrize("angle", [1e-9, 1e-7, 2e-6, 1e-4, 1e-3, math.pi - 1e-3, math.pi - 1e-4])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rotation_vector_is_accurate_at_both_ends(angle, dtype):
+    axis = torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)
+    q = quat_from_axis_angle(axis, torch.tensor(angle).double()).to(dtype)
+    for sign in (1, -1):
+        found = quat_to_rotation_vector(sign * q).double()
+        assert (found - angle * axis).norm() < (1e-6 * angle + 1e-12 if angle < 1 else 1e-6)
+
+
+def test_rotation_vector_of_half_a_turn():
+    """Either axis is right."""
+    half = torch.tensor([0.0, 0.6, 0.0, -0.8], dtype=torch.float64)
+    for q in (half, -half):
+        found = quat_to_rotation_vector(q)
+        close(found.norm(), math.pi)
+        close((found / math.pi * half[1:]).sum().abs(), 1.0)
+
+
+@pytest.mark.parametrize("q", [IDENTITY, -IDENTITY, QUARTER_X], ids=["identity", "negative identity", "quarter"])
+def test_rotation_vector_has_its_gradient(q):
+    """Twice that of the vector part at the identity."""
+    jacobian = torch.autograd.functional.jacobian(quat_to_rotation_vector, q)
+    assert jacobian.isfinite().all()
+    if q[1] == 0:
+        close(jacobian[:, 1:], 2 * q[0] * torch.eye(3, dtype=torch.float64))
+
+
 @pytest.mark.parametrize(
     ("function", "shapes", "expected"),
     [
@@ -199,6 +244,7 @@ def test_rot6d_is_the_first_two_columns(q):
         (quat_from_axis_angle, [(5, 3), (5,)], (5, 4)),
         (quat_from_euler, [(5, 2, 3)], (5, 2, 4)),
         (quat_to_rot6d, [(5, 3, 4)], (5, 3, 6)),
+        (quat_to_rotation_vector, [(5, 3, 4)], (5, 3, 3)),
         (quat_apply, [(0, 4), (0, 3)], (0, 3)),
     ],
 )

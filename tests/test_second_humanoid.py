@@ -17,11 +17,13 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from hdmi.assembly import make_env, make_task, scene_parts
+from hdmi.assembly import make_env, make_task, make_transforms, scene_parts
 from hdmi.assets import Effector, Robot, RobotConfig, SimConfig, build_scene, g1, g1_robot, mjcf_robot
 from hdmi.config import CONF, ConfigError
 from hdmi.learning import Trainer
-from hdmi.motion import MotionError, forward_kinematics, load_motion, make_reference
+from hdmi.motion import MotionError, forward_kinematics, load_motion, make_playback, make_reference
+from hdmi.motion.dynamics import inverse_dynamics, reference_torque
+from hdmi.transforms import FeedForwardTarget
 from hdmi.workshop.annotate import annotate_motion
 from hdmi.workshop.validate import validate_motion
 
@@ -416,6 +418,25 @@ class TestMotion:
         assert reference.joint_pos.shape == (T, 13)
         assert reference.body_pos.shape == (T, 14, 3)
         assert (reference.joint_pos[:, JOINTS.index("chest_turn")] == 0.3).all()
+
+    def test_torques_carry_this_robot(self, folder: Path, robot: Robot) -> None:
+        playback = make_playback(load_motion(folder / "motions" / "bends"), robot=RobotConfig(robot))
+        dynamics = inverse_dynamics(playback)
+        assert dynamics.torque.shape == (T, 13)
+        assert dynamics.missing_force.max() < 0.05  # body weights; it stands all along
+        knees = [JOINTS.index(f"shank_{side}_turn") for side in "lr"]
+        assert (dynamics.torque[:, knees] < -1).all()  # N m: they keep it from bending
+        smooth = reference_torque(playback.scene, playback.reference)
+        assert np.abs(smooth - dynamics.torque).max() < 5
+
+    def test_feedforward_is_for_its_servos(self, config) -> None:
+        cfg = config("bends", "+lever=feedforward")
+        task = make_task(cfg)
+        (ahead,) = (t for _, t in make_transforms(cfg, task) if isinstance(t, FeedForwardTarget))
+        r, robot = task.reference, task.scene.robot
+        kp, kd, limit = (torch.tensor(v) for v in (robot.stiffness, robot.damping, robot.effort_limits))
+        expected = r.joint_pos + (task.joint_torque.clamp(-0.8 * limit, 0.8 * limit) + kd * r.joint_vel) / kp
+        torch.testing.assert_close(ahead.targets, expected)
 
     def test_the_g1_does_not_know_it(self, folder: Path) -> None:
         with pytest.raises(MotionError, match=r"joint_names: \['hip_l_turn'"):

@@ -30,6 +30,7 @@ JOINTS = ("a_joint", "b_joint", "c_joint", "d_joint")
 
 ROBOT_BODY = tuple(("robot", f"body_{key}") for key in ("pos", "quat", "lin_vel", "ang_vel"))
 ROOT = (("robot", "root_pos"), ("robot", "root_quat"))
+MOVING_ROOT = (*ROOT, ("robot", "root_lin_vel"), ("robot", "root_ang_vel"))
 CONTACT = (("contact", "eef_pos"), ("contact", "target_pos"), ("contact", "force"), ("ref", "contact"))
 X, Y, POSE = ("obs", "x"), ("obs", "y"), ("obs", "pose")
 QUAT = ROBOT_BODY[1]
@@ -43,8 +44,8 @@ class Case:
     """How to make a transform, and what it must find.
 
     build: makes it from the required keys, which go through `r`, and keywords for the other ones.
-    kind: `function` of the entries of one step; `reward` of those of the next step; `inverse`, rewrites the action;
-    `state`, carries state from step to step; `init`, writes what the environment resets to.
+    kind: `function` of the entries of one step; `reward` of those of the next step; `inverse`, rewrites the action
+    or adds to it; `state`, carries state from step to step; `init`, writes what the environment resets to.
     random: draws numbers. ends: may end episodes.
     """
 
@@ -83,6 +84,16 @@ def motion_end(r: Rename, **keys) -> Transform:
     end = T.MotionEnd(lift_box().reference, **keys)
     end.last = 5
     return end
+
+
+def feedforward(r: Rename, **keys) -> Transform:
+    reference, servo = lift_box().reference, [50.0] * 29
+    return T.FeedForwardTarget(reference, torch.ones_like(reference.joint_pos), servo, servo, servo, **keys)
+
+
+def spring(r: Rename, **keys) -> Transform:
+    state = [r(key) for key in MOVING_ROOT]
+    return T.SpringAssist(lift_box().reference, robot_mass=35.0, total_steps=20, state_keys=state, **keys)
 
 
 def object_joint(r: Rename, **keys) -> Transform:
@@ -146,6 +157,7 @@ CASES: dict[str, Case] = {
         ERRORS,
         ends=True,
     ),
+    "FeedForwardTarget": Case(feedforward, "function", (("ref", "step"),)),
     "FeetAirTime": Case(lambda r, **k: T.FeetAirTime(**k), "reward", (("feet", "swing_time"), ("feet", "touchdown"))),
     "FeetImpactL2": Case(
         lambda r, **k: T.FeetImpactL2(35.0, **k), "reward", (("feet", "force"), ("feet", "previous_force"))
@@ -215,7 +227,9 @@ CASES: dict[str, Case] = {
         lambda r, **k: T.RelativeJointPos(r("out"), default_joint_pos(), **k), "function", (("robot", "joint_pos"),)
     ),
     "ResidualAction": Case(lambda r, **k: T.ResidualAction(**k), "inverse", (("ref", "joint_pos"),)),
+    "Rewind": Case(lambda r, **k: T.Rewind(**k), "init", (("ref", "step"),), random=True),
     "RewardRate": Case(lambda r, **k: T.RewardRate(0.02, **k), "reward"),
+    "SpringAssist": Case(spring, "inverse", (("ref", "step"), *MOVING_ROOT)),
     "SurvivalReward": Case(lambda r, **k: T.SurvivalReward(**k), "reward"),
     "TrackedBodies": Case(
         lambda r, **k: T.TrackedBodies([".*_knee_link", "pelvis"], g1.BODY_NAMES, **k),
@@ -348,6 +362,15 @@ def spelled(name: str, rename: Rename) -> tuple[TransformedEnv, list[TensorDict]
     return env, [start.clone(), *drive(env, 3, start=start)]
 
 
+def start_after_failures(env: TransformedEnv, rename: Rename) -> TensorDictBase:
+    """What an environment is told to reset to when all its episodes have failed."""
+    out = TensorDict({}, batch_size=[N])
+    out.set(rename("terminated"), torch.ones(N, 1, dtype=torch.bool))
+    out.set(rename(("ref", "step")), torch.tensor([[30], [130], [230]]))
+    torch.manual_seed(0)
+    return env.transform._reset_env_preprocess(out)
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_every_key_is_an_argument(name):
     """With other names for all entries nothing changes but the names, and no entry has a name of ours."""
@@ -361,9 +384,11 @@ def test_every_key_is_an_argument(name):
             ours, theirs = ours.exclude("next"), theirs.exclude("next")
             assert {key[0] for key in theirs.keys(True, True)} == {"new"}
             assert_same(theirs["new"], ours)
-    asked = [td if td is None else td.exclude("_reset") for td in (env.base_env.asked, other.base_env.asked)]
     if CASES[name].kind == "init":
-        assert_same(asked[1]["new"], asked[0])
+        ours, theirs = start_after_failures(env, lambda key: key), start_after_failures(other, new)
+        assert "init" in ours.keys()
+        assert set(theirs.keys()) == {"new"}
+        assert_same(theirs["new"], ours)
     check_env_specs(other)
 
 
@@ -437,7 +462,7 @@ def test_specs_that_are_given_are_left_alone(name):
 
 # What the environment must read besides its own keys, or in another shape, does not pass through a batch of
 # environments: these stand next to the base environment.
-NEXT_TO_THE_BASE = {"ActionDelay", "RandomPush", *(name for name in CASES if CASES[name].kind == "init")}
+NEXT_TO_THE_BASE = {"ActionDelay", "RandomPush", "SpringAssist", *(name for name in CASES if CASES[name].kind == "init")}
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if name not in NEXT_TO_THE_BASE])
@@ -616,6 +641,7 @@ class TestInverse:
         expected = {
             "JointPositionAction": torch.tensor([[0.5, 0, 1, 0], [1.5, 0, 2, 0], [2.5, 0, 3, 0]]),
             "DefaultPoseAction": torch.tensor([1.1, 1.2, 1.3, 1.4]).expand(N, 4),
+            "SpringAssist": self.ones,
             "ResidualAction": 1 + env.base_env.script[("ref", "joint_pos")][0] if name == "ResidualAction" else None,
         }[name]
         torch.testing.assert_close(env.base_env.received, expected)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
+import mujoco
 import pytest
 import torch
 from mocks import ScriptedEnv, constant, drive, lift_box, make_script, wrap
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.envs import Compose
 from torchrl.envs.utils import check_env_specs
 
 import hdmi.functional as F
 import hdmi.transforms as T
 from hdmi.assets import Effector, default_joint_pos, g1
-from hdmi.envs import BatchBackend, HumanoidObjectEnv
+from hdmi.envs import BatchBackend, HumanoidObjectEnv, MaskedResetEnv, ResetEnv, RowResetEnv
 from hdmi.functional import local_pose, quat_apply, quat_from_euler, quat_multiply
 
 X = ("obs", "x")
@@ -221,6 +224,77 @@ class TestAdaptiveStateInitialization:
         close(init.failures[[2, 9]], [0.5, 1.0])
 
 
+class TestRewind:
+    def rewound(self, step: int, failed: bool = True, n: int = 500, **kwargs) -> Tensor:
+        """Frames after n episodes that ended at a step; -1 where one is to be drawn. [n]"""
+        ended = {"terminated": torch.full((n, 1), failed), "ref": {"step": torch.full((n, 1), step)}}
+        out = T.Rewind(**kwargs)._reset_env_preprocess(TensorDict(ended, batch_size=[n]))
+        return out["init", "rewind_frame"].squeeze(-1)
+
+    def test_goes_back_by_each_number_of_steps(self):
+        assert self.rewound(100, share=1.0, steps=(5, 9)).unique().tolist() == [91, 92, 93, 94, 95]
+
+    def test_not_before_the_first_frame(self):
+        assert self.rewound(6, share=1.0, steps=(5, 9)).unique().tolist() == [0, 1]
+
+    @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+    def test_share(self, share):
+        chosen = self.rewound(100, n=4000, share=share) >= 0
+        assert float(chosen.float().mean()) == pytest.approx(share, abs=0.03 if share == 0.3 else 0.0)
+
+    def test_what_did_not_fail_is_left_to_be_drawn(self):
+        assert self.rewound(100, failed=False, share=1.0).unique().tolist() == [-1]
+
+    def test_nothing_to_do_in_the_first_reset(self):
+        assert T.Rewind()._reset_env_preprocess(None) is None
+        empty = TensorDict({}, batch_size=[3])
+        assert "init" not in T.Rewind()._reset_env_preprocess(empty).keys()
+
+    @pytest.mark.parametrize("steps", [(-1, 5), (9, 5)])
+    def test_bad_steps(self, steps):
+        with pytest.raises(ValueError, match=r"rewind: steps: expected 0 <= least <= most, got \["):
+            T.Rewind(steps=steps)
+
+    @pytest.mark.parametrize("share", [-0.1, 1.5])
+    def test_bad_share(self, share):
+        with pytest.raises(ValueError, match=rf"rewind: share: expected 0 to 1, got {share}"):
+            T.Rewind(share=share)
+
+    def test_starts_are_there_unless_they_are_to_be_drawn(self, reference):
+        start = T.ReferenceStateInitialization(reference, g1.JOINT_RANGES, start=7, margin=20)
+        asked = TensorDict({"init": {"rewind_frame": torch.tensor([[-1], [0], [60], [299]])}}, batch_size=[4])
+        init = start._reset_env_preprocess(asked.clone())["init"]
+        last = reference.num_frames - 21  # no episode starts in the margin
+        assert init["frame"].flatten().tolist() == [7, 0, 60, last]
+        close(init["root_pos"], reference.body_pos[[7, 0, 60, last], 0])
+        asked["init", "frame"] = torch.tensor([[1], [2], [3], [4]])  # of a start that is drawn again
+        assert start._reset_env_preprocess(asked)["init", "frame"].flatten().tolist() == [1, 2, 3, 4]
+
+    @pytest.mark.parametrize("redraws", [0, 1, 4])
+    @pytest.mark.parametrize("cls", [RowResetEnv, MaskedResetEnv])
+    def test_in_environments_that_draw_again(self, reference, cls: type[ResetEnv], redraws: int):
+        """Every start counts as too deep, so that all are drawn again as often as may be."""
+        scene = lift_box().scene
+        clock = T.MotionReference(reference, ["pelvis"], ["waist_.*"], g1.BODY_NAMES, g1.JOINT_NAMES)
+        start = T.ReferenceStateInitialization(reference, g1.JOINT_RANGES, start=20)
+        stack = Compose(start, T.Rewind(share=1.0, steps=(4, 6)), clock)
+        base = HumanoidObjectEnv(scene, 4, lambda m, n: BatchBackend(m, n, 1))
+        env = cls(base, stack, max_penetration=-1.0, redraws=redraws)
+        td = env.reset()
+        for _ in range(3):
+            td = env.step_mdp(env.step(td.set("action", td["robot", "joint_pos"])))
+        assert td["ref", "step"].flatten().tolist() == [23] * 4
+        td["done"][:3] = td["terminated"][:2] = True  # two have failed, one is complete, one goes on
+        before = env.num_redrawn
+        after = env.maybe_reset(td)
+        frames = after["ref", "step"].flatten()
+        assert all(17 <= frame <= 19 for frame in frames[:2])
+        assert frames[2:].tolist() == [20, 23]
+        assert env.num_redrawn - before == 3 * redraws
+        close(after["robot", "root_pos"][:3], reference.body_pos[frames[:3], 0], 1e-5)
+        close(after["ref", "joint_pos"], reference.joint_pos[frames])
+
+
 class TestMotionEnd:
     def test_truncates_at_the_last_frame(self):
         steps = torch.tensor([0, 1, 2, 3, 3]).reshape(-1, 1, 1)
@@ -271,6 +345,168 @@ def test_residual_is_added_to_the_reference_of_the_present_step():
         td = env.step(td.set("action", torch.full((1, 4), 0.5)))
         close(env.base_env.received, [[t + 0.5] * 4])
         td = env.step_mdp(td)
+
+
+class TestFeedForwardTarget:
+    def stack(self, reference, start: int, base_key: str) -> list:
+        robot, torque = lift_box().scene.robot, lift_box().joint_torque
+        servos = robot.stiffness, robot.damping, robot.effort_limits
+        return [
+            T.ReferenceStateInitialization(reference, g1.JOINT_RANGES, start=start),
+            T.MotionReference(reference, ["pelvis"], ["waist_.*"], g1.BODY_NAMES, g1.JOINT_NAMES),
+            T.FeedForwardTarget(reference, torque, *servos, effort=1.0),
+            T.ResidualAction(("ref", base_key)),
+        ]
+
+    @pytest.mark.parametrize("frame", [0, 90, 150])
+    def test_servos_on_the_reference_give_its_torque(self, reference, frame):
+        scene = lift_box().scene
+        env = physics(1, *self.stack(reference, frame, "joint_target"))
+        start = env.reset()
+        env.step(start.clone().set("action", torch.zeros(1, 29)))
+        close(env.base_env.backend.data("ctrl")[0].float(), start["ref", "joint_target"][0])
+        env.reset()
+        model, data = env.base_env.backend.world(0)
+        data.ctrl[:] = start["ref", "joint_target"][0].numpy()
+        mujoco.mj_forward(model, data)
+        torque = torch.from_numpy(data.qfrc_actuator + data.qfrc_passive)[scene.joint_dof].float()
+        limit = torch.tensor(scene.robot.effort_limits)
+        wanted = lift_box().joint_torque[frame]
+        assert wanted.abs().max() > 10
+        close(torque, wanted.clamp(-limit, limit), 0.01)
+
+    def test_the_robot_gives_way_less(self, reference):
+        """Under a policy that does nothing."""
+
+        def error(base_key: str) -> float:
+            env = physics(1, *self.stack(reference, 0, base_key))
+            step = drive(env, 25, lambda _: torch.zeros(1, 29))[-1]["next"]
+            return float((step["robot", "joint_pos"] - step["ref", "joint_pos"]).norm())
+
+        assert error("joint_target") < 0.5 * error("joint_pos")
+
+    def test_targets_of_the_motion_take_precedence(self, reference):
+        def unwanted() -> Tensor:
+            raise AssertionError("computed for nothing")
+
+        own = replace(reference, joint_target=reference.joint_pos + 0.1)
+        ahead = T.FeedForwardTarget(own, unwanted, [1.0] * 29, [1.0] * 29, [1.0] * 29)
+        found = ahead(TensorDict({"ref": {"step": torch.tensor([[3], [0]])}}, batch_size=[2]))["ref", "joint_target"]
+        close(found, own.joint_target[[3, 0]])
+
+    def test_effort_is_what_torques_are_clipped_to(self, reference):
+        servos = {"servo_stiffness": [100.0] * 29, "servo_damping": [0.0] * 29, "effort_limits": [50.0] * 29}
+        torque = torch.full_like(reference.joint_pos, 45.0)
+        for effort, ahead in ((1.0, 0.45), (0.8, 0.4), (0.0, 0.0)):
+            term = T.FeedForwardTarget(reference, lambda: torque, **servos, effort=effort)
+            close(term.targets, reference.joint_pos + ahead)
+        for effort in (-0.1, 1.1):
+            with pytest.raises(ValueError, match=f"effort: expected a share from 0 to 1, got {effort}"):
+                T.FeedForwardTarget(reference, torque, **servos, effort=effort)
+
+
+class TestSpringAssist:
+    def env(self, reference, *bodies: str, start: int = 0, **kwargs):
+        """The embedded scene with springs of 2 Hz, starting at a frame."""
+        given = {"robot_mass": g1.TOTAL_MASS, "total_steps": 1000, "frequency": 2.0, "max_acceleration": 1e3} | kwargs
+        clock = T.MotionReference(reference, ["pelvis"], ["waist_.*"], g1.BODY_NAMES, g1.JOINT_NAMES)
+        springs = [T.SpringAssist(reference, body=body, **given) for body in bodies]
+        start = T.ReferenceStateInitialization(reference, g1.JOINT_RANGES, start=start)
+        return physics(1, start, clock, T.ResidualAction(), *springs)
+
+    def here(self, reference, frame: int = 100, **off: list[float]) -> TensorDict:
+        """The root where the next frame has it, but for some offsets."""
+        parts = ("root_pos", "root_lin_vel", "root_ang_vel")
+        goal = (reference.body_pos, reference.body_lin_vel, reference.body_ang_vel)
+        root = {
+            key: value[frame + 1 : frame + 2, 0] - torch.tensor(off.get(key, [0.0, 0.0, 0.0]))
+            for key, value in zip(parts, goal, strict=True)
+        }
+        turn = quat_from_euler(torch.tensor([off.get("root_rpy", [0.0, 0.0, 0.0])]))
+        root["root_quat"] = quat_multiply(turn, reference.body_quat[frame + 1 : frame + 2, 0])
+        return TensorDict({"ref": {"step": torch.tensor([[frame]])}, "robot": root}, batch_size=[1])
+
+    def test_by_hand(self, reference):
+        spring = T.SpringAssist(
+            reference, robot_mass=4.0, total_steps=10, frequency=1 / math.pi, radius=0.5, max_acceleration=1e3
+        )  # 2 rad/s
+
+        def wrench(**off: list[float]) -> Tensor:
+            return spring.inv(self.here(reference, **off))["wrench", "root"][0]
+
+        close(wrench(), torch.zeros(6), 1e-4)
+        close(wrench(root_pos=[0.1, 0.0, 0.2]), [1.6, 0, 3.2, 0, 0, 0], 1e-4)  # 4 kg times 4 / s^2
+        close(wrench(root_lin_vel=[0.0, -0.5, 0.0]), [0, -8, 0, 0, 0, 0], 1e-4)  # 4 kg times 4 / s
+        close(wrench(root_rpy=[0.0, 0.0, 0.3]), [0, 0, 0, 0, 0, -1.2], 1e-4)  # 1 kg m^2 times 4 / s^2, back
+        close(wrench(root_ang_vel=[0.5, 0.0, 0.0]), [0, 0, 0, 2, 0, 0], 1e-4)
+
+    def test_is_limited(self, reference):
+        spring = T.SpringAssist(reference, robot_mass=4.0, total_steps=10, radius=0.5, max_acceleration=2.0)
+        far = spring.inv(self.here(reference, root_pos=[3.0, 4.0, 0.0], root_rpy=[0.0, 2.0, 0.0]))["wrench", "root"][0]
+        close(far[:3], [4.8, 6.4, 0.0], 1e-3)  # 4 kg times 2 m/s^2, its direction kept
+        close(far[3:].norm(), 4.0, 1e-3)  # half a metre of that
+
+    def test_fades_to_nothing_with_the_steps_taken(self, reference):
+        env = self.env(reference, "root", total_steps=8, fade=0.5)
+        spring = env.transform[-1]
+        left = [float(spring.strength)]
+        for _ in range(6):
+            drive(env, 1, lambda _: torch.zeros(1, 29))  # resets do not count, nor start it anew
+            left.append(float(spring.strength))
+        assert left == [1.0, 0.75, 0.5, 0.25, 0.0, 0.0, 0.0]
+        away = self.here(reference, root_pos=[1.0, 0.0, 0.0])
+        assert not spring.inv(away)["wrench", "root"].any()
+        spring.steps.fill_(1)
+        close(spring.strength, 0.75)
+
+    @pytest.mark.parametrize("body", ["root", "object"])
+    def test_pulls_to_the_reference(self, reference, body):
+        """In MuJoCo: what starts beside the reference's comes nearer, as a critically damped spring does."""
+        key = ("robot", "root_pos") if body == "root" else ("object", "pos")
+        goal = reference.body_pos[:, 0] if body == "root" else reference.object_pos
+        at = 0 if body == "root" else lift_box().scene.object_free_qpos
+        gaps = {}
+        for bodies in ((), (body,)):
+            env = self.env(reference, *bodies)
+            td = env.reset()
+            env.base_env.backend.data("qpos")[:, at : at + 3] += torch.tensor([0.0, 0.3, 0.3])
+            env.base_env.backend.refresh(torch.arange(1))
+            td.update(env.base_env._state(slice(None)))
+            step = drive(env, 20, lambda _: torch.zeros(1, 29), td)[-1]["next"]
+            gaps[bodies] = float((step.get(key)[0] - goal[20])[:2].norm())
+        # (1 + w t) exp(-w t) of the gap is left after 0.4 s at 2 Hz: 4 %
+        assert gaps[(body,)] < 0.25 * gaps[()]
+
+    def test_both(self, reference):
+        env = self.env(reference, "root", "object")
+        check_env_specs(env)
+        sent = env.transform.inv(env.reset().set("action", torch.zeros(1, 29)))["wrench"]
+        assert set(sent.keys()) == {"root", "object"}
+
+    def test_the_count_goes_with_the_state(self, reference):
+        first, second = (self.env(reference, "root") for _ in range(2))
+        drive(first, 3, lambda _: torch.zeros(1, 29))
+        second.transform.load_state_dict(first.transform.state_dict())
+        assert float(second.transform[-1].steps) == 3
+        assert float(second.transform[-1].strength) == pytest.approx(1 - 3 / 500)
+
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ({"body": "left_hand"}, "assist: body: expected 'root' or 'object', got 'left_hand'"),
+            ({"fade": 0.0}, "assist: fade: expected a share of the training, above 0 and up to 1, got 0.0"),
+            ({"fade": 1.5}, "assist: fade: .* got 1.5"),
+            ({"body": "object", "object_free": False}, "motion 'lift_box' has no object that can be pulled"),
+        ],
+    )
+    def test_refusals(self, reference, given, message):
+        with pytest.raises(ValueError, match=message):
+            T.SpringAssist(reference, robot_mass=1.0, total_steps=10, **given)
+
+    def test_reads_what_nothing_writes(self, reference):
+        spring = T.SpringAssist(reference, robot_mass=1.0, total_steps=10)
+        with pytest.raises(KeyError, match=r"SpringAssist: reads \('ref', 'step'\), which nothing before it writes"):
+            wrap(blank(2), spring).full_state_spec  # noqa: B018
 
 
 def test_default_pose_is_the_robots_unless_given():

@@ -184,6 +184,8 @@ class HumanoidObjectEnv(EnvBase):
         if wrenches is not None:
             self._pull(wrenches)
         self.backend.step(targets.repeat_interleave(decimation // count, dim=1))
+        if wrenches is not None:
+            self.backend.data("xfrc_applied").zero_()  # it would act in later steps, too
         failed = self.backend.failed()
         out = self._survivors(failed)
         terminated = failed.unsqueeze(-1)

@@ -36,6 +36,7 @@ class SpringAssist(SpecTransform):
         robot_mass: kg.
         total_steps: of the training, for each environment.
         body: `root` or `object`.
+        object_free: whether the object can be pulled: not where it stands fixed in the world.
         fade: share of `total_steps` after which nothing is left.
         frequency: of the spring, Hz.
         radius: of gyration, m: moments are for a body of inertia m radius^2.
@@ -59,6 +60,7 @@ class SpringAssist(SpecTransform):
         robot_mass: float,
         total_steps: int,
         body: Literal["root", "object"] = "root",
+        object_free: bool = True,
         fade: float = 0.5,
         frequency: float = 1.0,
         radius: float = 0.3,
@@ -75,11 +77,11 @@ class SpringAssist(SpecTransform):
         if body == "root":
             parts = [getattr(reference, f"body_{name}")[:, 0] for name in _POSE]
             keys: list[NestedKey] = [("robot", f"root_{name}") for name in _POSE]
-        elif reference.has_object:
+        elif reference.has_object and object_free:
             parts = [getattr(reference, f"object_{name}") for name in _POSE]
             keys = [("object", name) for name in (*_POSE, "mass")]
         else:
-            raise ValueError(f"assist: body: motion {reference.name!r} has no object to pull")
+            raise ValueError(f"assist: body: motion {reference.name!r} has no object that can be pulled")
         self.step_key = key_of(step_key)
         self.state_keys = [self.step_key, *(key_of(key) for key in (keys if state_keys is None else state_keys))]
         self.out_key = below("wrench", body) if out_key is None else key_of(out_key)

@@ -176,7 +176,7 @@ class ReferenceStateInitialization(SpecTransform):
 
     Reads on reset, all optional: `init/object_scale` [N, 1], which transforms farther out draw; `init/frame` int64
     [N, 1], where to start instead of at a drawn frame; `init/rewind_frame` int64 [N, 1], likewise, where it is not
-    negative; `init/noise_share` [N, 1], factor of all perturbations.
+    negative, but not within the margin; `init/noise_share` [N, 1], factor of all perturbations.
     Writes, before the base environment resets: `init/frame` and the state under `init_key` that `HumanoidObjectEnv`
     reads. It has no effect between resets.
 
@@ -267,7 +267,8 @@ class ReferenceStateInitialization(SpecTransform):
         if frames is None:
             frames = self._start_frames(tensordict.batch_size, tensordict.device).unsqueeze(-1)
             rewound = tensordict.get(self.rewind_key, None)
-            frames = frames if rewound is None else torch.where(rewound < 0, frames, rewound)
+            if rewound is not None:
+                frames = torch.where(rewound < 0, frames, rewound.clamp(max=self.num_starts - 1))
             tensordict.set(self.frame_key, frames)
         scale, noise_share = tensordict.get(self.scale_key, None), tensordict.get(self.noise_share_key, None)
         for key, value in self.initial_state(frames.squeeze(-1), scale, noise_share).items():

@@ -167,6 +167,8 @@ def _with_body(motion: Motion, name: str, pos: np.ndarray, quat: np.ndarray) -> 
 
 def _with_joint(motion: Motion, name: str, angle: np.ndarray) -> Motion:
     new = {"joint_pos": angle, "joint_vel": derivative(angle, motion.fps)}
+    if motion.joint_target is not None:
+        new["joint_target"] = angle  # no servo drives it
     names, arrays = _with_column(motion.joint_names, name, {key: getattr(motion, key) for key in new}, new)
     return replace(motion, joint_names=names, **arrays)
 

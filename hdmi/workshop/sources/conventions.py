@@ -103,7 +103,12 @@ def reread(motion: Motion, given: Conventions) -> Motion:
         ang_vel = angular_velocity(quat, motion.fps).astype(np.float32)
         motion = replace(motion, body_quat_w=quat, body_ang_vel_w=ang_vel)
     if given.angles == "degrees":
-        motion = replace(motion, joint_pos=given.radians(motion.joint_pos), joint_vel=given.radians(motion.joint_vel))
+        motion = replace(
+            motion,
+            joint_pos=given.radians(motion.joint_pos),
+            joint_vel=given.radians(motion.joint_vel),
+            joint_target=None if motion.joint_target is None else given.radians(motion.joint_target),
+        )
     if given.unit is not None:
         motion = replace(
             motion,

@@ -283,4 +283,6 @@ def lost_by(full: Motion, *, bodies: bool) -> list[str]:
         lost.append("object_contact")
     if full.contact_points is not None:
         lost.append("contact_points")
+    if full.joint_target is not None:
+        lost.append("joint_target")
     return lost
