@@ -24,7 +24,7 @@ from torchrl.objectives.value import GAE
 from hdmi.commands.train import open_run, run_folder
 from hdmi.learning import CheckpointError, RunningNorm, Trainer, load_checkpoint, load_policy, save_checkpoint
 from hdmi.learning.checkpoint import FORMAT, checkpoints, claim
-from hdmi.learning.networks import bound_noise, make_actor, network_of, normalised_networks
+from hdmi.learning.networks import bound_noise, make_actor, network_of, normalised_actor, normalised_critic
 from hdmi.learning.policy import export_policy, make_networks
 from hdmi.learning.trainer import DivergenceError
 from hdmi.metrics import read_rows
@@ -313,7 +313,7 @@ class TestPrepare:
         self, fresh: Trainer, batch: TensorDictBase
     ) -> None:
         data = fresh.prepare(batch)
-        losses = fresh.loss(data)
+        losses = fresh.objective.loss(data)
         critic = torch.nn.functional.smooth_l1_loss(data["state_value"], data["value_target"])
         torch.testing.assert_close(losses["loss_critic"], critic)
         torch.testing.assert_close(losses["kl_approx"], torch.tensor(0.0), rtol=0, atol=1e-4)
@@ -325,7 +325,7 @@ class TestPrepare:
         cfg = config(f"algo.bf16={bf16}")
         actor, critic = make_networks(cfg, sizes, torch.device("cpu"))
         network_of(actor).norm.update(torch.full((sizes["policy"],), 0.3), torch.full((sizes["policy"],), 2.0), n=9)
-        own_actor, own_critic = normalised_networks(actor, critic)
+        own_actor, own_critic = normalised_actor(actor), normalised_critic(critic)
         data = batch.select("policy", "critic").clone()
         for key, network in (("policy", actor), ("critic", critic)):
             data[key] = network_of(network).normalise(data[key])

@@ -145,7 +145,7 @@ class Guard:
     def limit(
         self, target: np.ndarray, stiffness: np.ndarray, damping: np.ndarray, sensors: dict[str, np.ndarray]
     ) -> np.ndarray:
-        """A target within the joint ranges, if these are limits, that asks for no more torque than the motors have. rad [J]
+        """A target within the joint ranges, if these are limits, for no more torque than the motors have. rad [J]
 
         The torque is that of the servo at the measured state, `kp (target - q) - kd qd`.
         """

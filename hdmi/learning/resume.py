@@ -29,7 +29,7 @@ KEPT = {
 }
 # What decides the problem, besides the nodes of the stack, and the networks' form.
 _PROBLEM = ("stack", "starts", "task", "robot", "sim", "reference_set", "num_envs")
-_NETWORKS = ("actor_hidden", "critic_hidden", "activation")
+_NETWORKS = ("trainer", "actor_hidden", "critic_hidden", "activation")
 
 _Path = tuple[str, ...]
 
