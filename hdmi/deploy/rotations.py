@@ -48,6 +48,19 @@ def quat_from_rotation_vector(vector: np.ndarray) -> np.ndarray:
     return np.concatenate([np.cos(half), 0.5 * vector * np.sinc(half / np.pi)], axis=-1)
 
 
+def rotation_vector(quat: np.ndarray) -> np.ndarray:
+    """Axis times angle of the shorter way round, rad. [..., 4] -> [..., 3]"""
+    quat = np.where(quat[..., :1] < 0, -quat, quat)
+    sine = np.linalg.norm(quat[..., 1:], axis=-1, keepdims=True)
+    half = np.arctan2(sine, quat[..., :1])
+    return 2.0 * quat[..., 1:] * np.where(sine > 1e-9, half / np.maximum(sine, 1e-9), 1.0)
+
+
+def matrix_of(quat: np.ndarray) -> np.ndarray:
+    """Rotation matrices. [..., 4] -> [..., 3, 3]"""
+    return np.stack([quat_apply(quat, np.broadcast_to(axis, (*quat.shape[:-1], 3))) for axis in np.eye(3)], axis=-1)
+
+
 def quat_from_euler(angles: np.ndarray) -> np.ndarray:
     """Roll, pitch and yaw about the fixed axes x, y, z in this order, rad. [..., 3] -> [..., 4]"""
     turns = [quat_from_rotation_vector(angles[..., i : i + 1] * np.eye(3)[i]) for i in range(3)]
