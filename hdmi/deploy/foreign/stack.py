@@ -115,8 +115,9 @@ class Observer:
         depth = max(spec.lags)
         first = np.zeros_like(value) if spec.fill == "zero" else value
         begun = np.broadcast_to(first[..., None, :], (*lead, depth, value.shape[-1]))
-        # newest first [..., depth, D]
-        past = np.where(fresh[..., None, None], begun, self.past.get(key, begun))
+        before = self.past.get(key, begun)
+        # newest first [..., depth, D]; of another number of worlds, it is another run's
+        past = np.where(fresh[..., None, None], begun, before if before.shape == begun.shape else begun)
         whole = np.concatenate([value[..., None, :], past], axis=-2)
         self.past[key] = whole[..., :depth, :]
         chosen = whole[..., list(spec.lags), :]
