@@ -4,6 +4,8 @@
     hdmi deploy policy=FOLDER robot=NAME auto=false log=FILE.npz  # keys: s to the start, r run, h hold, space damping
     hdmi deploy policy=FOLDER replay=FILE.npz [plot=FILE.png]         # the graph over logged sensors
 
+Instead of a folder, FILE.yaml: what describes a network of others, or that of `hdmi export` in the same words.
+
 With `episodes`, a simulated robot begins each episode at the perturbed first frame, and a table shows success, errors
 and timing. Without, the run goes through all states: damping, to the start, run, hold, damping; by itself if
 auto=true, else as keys, a gamepad or the robot's remote control ask for. It always ends in damping.
@@ -28,9 +30,11 @@ from hdmi.console import make_console
 from hdmi.deploy import runner, safety
 from hdmi.deploy.controls import Controls, Gamepad, Keyboard
 from hdmi.deploy.description import PolicyError
+from hdmi.deploy.foreign.policy import ForeignPolicy
 from hdmi.deploy.log import LogError, read_log, replay
 from hdmi.deploy.policy import Policy
 from hdmi.deploy.robot import RobotError
+from hdmi.deploy.trial import read_reference
 from hdmi.errors import ConfigError
 
 # Modules of hdmi.deploy.robots.
@@ -42,7 +46,7 @@ TOLERANCE = 1e-4  # rad that a replayed target may be off: another machine, anot
 class Options:
     """See the module."""
 
-    policy: str | None = None  # folder of policy.onnx, or the file
+    policy: str | None = None  # folder of policy.onnx, or the file; or a YAML that describes a network
     robot: str | None = None
     episodes: int = 0  # of a simulated robot
     replay: str | None = None  # a log
@@ -81,13 +85,14 @@ def run(arguments: list[str], console: Console) -> int:
     """Does what the options ask for; returns the exit status."""
     options, values, module = _parse(arguments)
     if options.policy is None:
-        raise ConfigError("give policy=FOLDER, that of an exported policy.onnx")
-    policy = Policy(options.policy)
+        raise ConfigError("give policy=FOLDER, that of an exported policy.onnx, or policy=FILE.yaml")
+    policy = _policy(options.policy)
     if options.replay is not None:
         return _replay(options, policy, console)
     if module is None:
         raise ConfigError(f"give robot=NAME, one of {', '.join(ROBOTS)}, or replay=LOG")
-    robot = module.connect(policy.description, policy.path.parent, values[module.Options])
+    files = policy.scene if isinstance(policy, ForeignPolicy) else policy.path.parent
+    robot = module.connect(policy.description, files, values[module.Options])
     try:
         if options.episodes > 0:
             return _episodes(options, values, policy, robot, console)
@@ -96,7 +101,19 @@ def run(arguments: list[str], console: Console) -> int:
         robot.close()
 
 
-def _drive(options: Options, values: dict[type, Any], policy: Policy, robot: Any, console: Console) -> int:
+def _policy(path: str) -> Policy | ForeignPolicy:
+    """An exported policy, or what a YAML describes."""
+    return ForeignPolicy(path) if path.endswith((".yaml", ".yml")) else Policy(path)
+
+
+def _reference(policy: Policy | ForeignPolicy) -> dict[str, np.ndarray]:
+    """The policy's motion."""
+    if isinstance(policy, ForeignPolicy):
+        return policy.reference
+    return read_reference(policy.path.parent, policy.description)
+
+
+def _drive(options: Options, values: dict[type, Any], policy: Policy | ForeignPolicy, robot: Any, console: Console) -> int:
     """One run through all states."""
     controls: list[Controls] = []
     try:
@@ -119,14 +136,14 @@ def _drive(options: Options, values: dict[type, Any], policy: Policy, robot: Any
     return 0 if drive.failure is None else 130 if drive.failure == "interrupted" else 1
 
 
-def _episodes(options: Options, values: dict[type, Any], policy: Policy, robot: Any, console: Console) -> int:
+def _episodes(options: Options, values: dict[type, Any], policy: Policy | ForeignPolicy, robot: Any, console: Console) -> int:
     """Episodes of a simulated robot, and their figures; log and plot are of the last."""
     from hdmi.deploy.robots.mujoco import MujocoRobot
-    from hdmi.deploy.trial import Judge, Result, read_reference
+    from hdmi.deploy.trial import Judge, Result
 
     if not isinstance(robot, MujocoRobot):
         raise ConfigError(f"episodes: only of robot=mujoco, which can be put back to the start, not of {options.robot}")
-    judge = Judge(robot, read_reference(policy.path.parent, policy.description))
+    judge = Judge(robot, _reference(policy))
     results = []
     how = replace(values[runner.Options], hold=0.0)
     for episode in range(options.episodes):
@@ -147,7 +164,7 @@ def _episodes(options: Options, values: dict[type, Any], policy: Policy, robot: 
     return 0
 
 
-def results_table(results: list[Any], policy: Policy) -> Table:
+def results_table(results: list[Any], policy: Policy | ForeignPolicy) -> Table:
     """Figures of episodes."""
     from hdmi.deploy.trial import UNITS, summarize
 
@@ -176,17 +193,25 @@ def _counts(drive: Any) -> str:
     return f"{len(ms)} ticks, {ms.mean():.2f} ms each (99 %: {np.percentile(ms, 99):.2f}); {counts}"
 
 
-def _finish(options: Options, drive: Any, policy: Policy) -> None:
+def _finish(options: Options, drive: Any, policy: Policy | ForeignPolicy) -> None:
     if options.log is not None:
         print(options.log)
     if options.plot is not None:
         from hdmi.deploy.plots import plot_log
 
         header = drive.log.header | {"events": drive.log.events}
-        print(plot_log(header, drive.log.arrays(), policy.description, options.plot, policy.path.parent))
+        print(plot_log(header, drive.log.arrays(), policy.description, options.plot, _shown_reference(policy)))
 
 
-def _replay(options: Options, policy: Policy, console: Console) -> int:
+def _shown_reference(policy: Policy | ForeignPolicy) -> dict[str, np.ndarray] | None:
+    """The motion to draw, if it is there."""
+    try:
+        return _reference(policy)
+    except PolicyError:
+        return None
+
+
+def _replay(options: Options, policy: Policy | ForeignPolicy, console: Console) -> int:
     """The graph over a log's sensors."""
     assert options.replay is not None
     header, arrays = read_log(options.replay)
@@ -197,7 +222,7 @@ def _replay(options: Options, policy: Policy, console: Console) -> int:
     if options.plot is not None:
         from hdmi.deploy.plots import plot_log
 
-        print(plot_log(header, arrays, policy.description, options.plot, policy.path.parent))
+        print(plot_log(header, arrays, policy.description, options.plot, _shown_reference(policy)))
     if differences.max() > TOLERANCE:
         print(f"that is more than {TOLERANCE:g} rad: not what the policy has done", file=sys.stderr)
         return 1

@@ -323,9 +323,9 @@ class MujocoRobot:
 
 
 def connect(description: Description, folder: Path, options: Options) -> MujocoRobot:
-    """The robot of a policy's `scene.xml`.
+    """The robot of a policy's `scene.xml`, or of the MJCF file that is given instead of the folder.
 
     Raises:
         PolicyError: if the file is not there or is another robot's.
     """
-    return MujocoRobot(description, folder / SCENE_FILE, options)
+    return MujocoRobot(description, folder if folder.suffix == ".xml" else folder / SCENE_FILE, options)
