@@ -113,7 +113,9 @@ def _reference(policy: Policy | ForeignPolicy) -> dict[str, np.ndarray]:
     return read_reference(policy.path.parent, policy.description)
 
 
-def _drive(options: Options, values: dict[type, Any], policy: Policy | ForeignPolicy, robot: Any, console: Console) -> int:
+def _drive(
+    options: Options, values: dict[type, Any], policy: Policy | ForeignPolicy, robot: Any, console: Console
+) -> int:
     """One run through all states."""
     controls: list[Controls] = []
     try:
@@ -136,7 +138,9 @@ def _drive(options: Options, values: dict[type, Any], policy: Policy | ForeignPo
     return 0 if drive.failure is None else 130 if drive.failure == "interrupted" else 1
 
 
-def _episodes(options: Options, values: dict[type, Any], policy: Policy | ForeignPolicy, robot: Any, console: Console) -> int:
+def _episodes(
+    options: Options, values: dict[type, Any], policy: Policy | ForeignPolicy, robot: Any, console: Console
+) -> int:
     """Episodes of a simulated robot, and their figures; log and plot are of the last."""
     from hdmi.deploy.robots.mujoco import MujocoRobot
     from hdmi.deploy.trial import Judge, Result

@@ -14,6 +14,7 @@ VERBS = {
     "plot": "learning curves of runs side by side",
     "export": "writes a policy alone, with evaluation, video and a card",
     "deploy": "runs an exported policy on a robot, real or simulated",
+    "foreign": "brings in networks of others: describes one, checks it",
     "tasks": "lists the tasks, checks them, or renders a picture of each",
     "retarget": "from a person's motion to the robot's",
     "convert": "reference motions from and to other projects' formats",

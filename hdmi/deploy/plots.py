@@ -24,7 +24,7 @@ def plot_log(
     arrays: Mapping[str, np.ndarray],
     description: Description,
     out: str | Path,
-    reference: Mapping[str, np.ndarray] | None = None,
+    reference: dict[str, np.ndarray] | None = None,
 ) -> Path:
     """Draws a log's rows.
 
@@ -32,7 +32,7 @@ def plot_log(
         header, arrays: of `hdmi.deploy.log.read_log`.
         description: of the policy.
         out: the picture.
-        reference: the motion, of `hdmi.deploy.trial.read_reference`; without it tracking is shown against targets alone.
+        reference: the motion, of `hdmi.deploy.trial.read_reference`; without it targets alone are shown.
 
     Raises:
         LogError: if the log has no ticks.

@@ -31,7 +31,9 @@ class Kinematics:
 
     def __init__(self, scene: str | Path, joint_names: Sequence[str]):
         if not Path(scene).is_file():
-            raise PolicyError(f"{scene}: there is no such file; `hdmi foreign task=NAME out=FOLDER` writes a task's scene")
+            raise PolicyError(
+                f"{scene}: there is no such file; `hdmi foreign task=NAME out=FOLDER` writes a task's scene"
+            )
         try:
             self.model = model = mujoco.MjModel.from_xml_path(str(scene))
         except ValueError as error:
@@ -92,7 +94,8 @@ class Kinematics:
         if body < 0 or not hinges or joint_pos is None:
             return pos_w, quat_w
         link, anchor = model.jnt_bodyid[hinges[0]], model.jnt_pos[hinges[0]]
-        turn = quat_from_rotation_vector(model.jnt_axis[hinges[0]] * (joint_pos - model.qpos0[model.jnt_qposadr[hinges[0]]]))
+        angle = joint_pos - model.qpos0[model.jnt_qposadr[hinges[0]]]
+        turn = quat_from_rotation_vector(model.jnt_axis[hinges[0]] * angle)
         fixed = np.broadcast_to(model.body_quat[link], quat_w.shape)
         moved = anchor - quat_apply(turn, np.broadcast_to(anchor, pos_w.shape))
         place = model.body_pos[link] + quat_apply(fixed, moved)

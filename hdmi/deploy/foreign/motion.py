@@ -1,4 +1,4 @@
-"""The motion that a network follows, in numpy: of a folder in this project's format, or of the network's own outputs."""
+"""The motion that a network follows, in numpy: of a folder in this project's format, or of other arrays."""
 
 from __future__ import annotations
 
@@ -167,9 +167,7 @@ def motion_of(
     )
 
 
-def _contacts(
-    arrays: Mapping[str, np.ndarray], frames: int, count: int, where: str
-) -> tuple[np.ndarray, np.ndarray]:
+def _contacts(arrays: Mapping[str, np.ndarray], frames: int, count: int, where: str) -> tuple[np.ndarray, np.ndarray]:
     """Labels [T, E] and points [T, E, 3] of `count` bodies; of none, where the motion has none."""
     labels = arrays.get("object_contact", np.zeros((frames, 0))).reshape(frames, -1)
     points = arrays.get("contact_points", np.zeros((frames, 0, 3))).reshape(frames, -1, 3)

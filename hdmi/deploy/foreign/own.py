@@ -67,7 +67,8 @@ def write_own(graph: PolicyGraph, task: Task, trial: Mapping[str, Any], folder: 
     folder, scene, robot = Path(folder), task.scene, task.scene.robot
     terms, action, hinge = own_terms(graph, task), own_action(graph, task), _hinge_name(task.scene)
     save_motion(_motion(task), folder / MOTION_FOLDER)
-    (folder / NETWORK_FILE).write_bytes(network_to_onnx(graph.network, len(graph.network.norm.mean)).SerializeToString())
+    model = network_to_onnx(graph.network, len(graph.network.norm.mean))
+    (folder / NETWORK_FILE).write_bytes(model.SerializeToString())
     lists = ("stiffness", "damping", "default_joint_pos", "effort_limits", "velocity_limits")
     numbers = {name: [float(value) for value in getattr(robot, name)] for name in lists}
     spec = {
@@ -80,6 +81,19 @@ def write_own(graph: PolicyGraph, task: Task, trial: Mapping[str, Any], folder: 
         **trial, "action": action, "inputs": {"obs": terms},
     }  # fmt: skip
     return write_spec(spec, folder / SPEC_FILE)
+
+
+def write_task_files(task: Task, folder: str | Path) -> Path:
+    """Writes `scene.xml` and `motion/` of a task, for a description of somebody else's network; returns the folder.
+
+    Raises:
+        OSError: if a file cannot be written.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / SCENE_FILE).write_text(task.scene.xml, encoding="utf-8")
+    save_motion(_motion(task), folder / MOTION_FOLDER)
+    return folder
 
 
 def own_terms(graph: PolicyGraph, task: Task) -> list[dict[str, Any]]:
@@ -100,8 +114,8 @@ def own_terms(graph: PolicyGraph, task: Task) -> list[dict[str, Any]]:
         if make is None or rest or len(chain) > 2:
             name = rest[0][0] if rest else name
             raise DeploymentError(f"{name}: has no equivalent among the terms of hdmi.deploy.foreign.terms")
-        past = {"lags": list(range(t.steps + 1)) for _, t in chain[1:] if isinstance(t, History)}
-        terms.append(make(graph, writer, task) | past)
+        term = make(graph, writer, task)
+        terms.append(term if len(chain) == 1 else term | {"lags": list(range(chain[1][1].steps + 1))})
     return terms
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -123,7 +124,7 @@ class ForeignPolicy:
         root_pos = given.get("root_pos_w", root)
         poses = self.kinematics(root_pos, given.get("root_quat_w", motion.body_quat_w[frame, 0]), joint_pos)
         velocity = (root_pos - self._root_pos) / self.spec.control_dt
-        return Moment(
+        now = Moment(
             step=np.array(frame),
             joint_pos=joint_pos,
             joint_vel=given.get("joint_vel", motion.joint_vel[frame]),
@@ -132,25 +133,24 @@ class ForeignPolicy:
             root_lin_vel_w=motion.body_lin_vel_w[frame, 0] if self._fresh else velocity,
             root_ang_vel_b=given.get("root_ang_vel_b", np.zeros(3)),
             action=self.stack.last_action(np.array(self._fresh)),
-            **self._thing(*(given.get(name) for name in ("object_pos_w", "object_quat_w", "object_joint_pos"))),
         )
+        return self._with_object(now, {name: value for name, value in given.items() if name.startswith("object_")})
 
-    def _thing(
-        self, pos: np.ndarray | None, quat: np.ndarray | None, joint_pos: np.ndarray | None
-    ) -> dict[str, np.ndarray | None]:
-        found = {"object_pos_w": pos, "object_quat_w": quat, "object_joint_pos": joint_pos}
-        if pos is None or quat is None:
-            return found
-        link = self.kinematics.link(self.spec.object, pos, quat, joint_pos)
-        return found | {"link_pos_w": link[0], "link_quat_w": link[1]}
+    def _with_object(self, now: Moment, measured: Mapping[str, np.ndarray]) -> Moment:
+        """The moment with the object, as far as it is measured, and its link."""
+        now = replace(now, **measured)
+        if not {"object_pos_w", "object_quat_w"} <= set(measured):
+            return now
+        joint_pos = measured.get("object_joint_pos")
+        pos, quat = self.kinematics.link(self.spec.object, now.object_pos_w, now.object_quat_w, joint_pos)
+        return replace(now, link_pos_w=pos, link_quat_w=quat)
 
     def in_motion(self, frames: np.ndarray) -> Moment:
         """What the terms see of a robot that is exactly in the motion. int [N]"""
         motion, base = self.motion, self.stack.base(frames)
         driven, scale = self.stack.driven, self.stack.scale
         offset = (motion.joint_pos[frames] - base)[..., driven]
-        there = motion.object_pos_w.shape[-1] > 0
-        return Moment(
+        now = Moment(
             step=frames,
             joint_pos=motion.joint_pos[frames],
             joint_vel=motion.joint_vel[frames],
@@ -160,12 +160,9 @@ class ForeignPolicy:
             root_ang_vel_b=quat_apply_inverse(motion.body_quat_w[frames, 0], motion.body_ang_vel_w[frames, 0]),
             # what asks for the motion's joint positions
             action=np.divide(offset, scale, out=np.zeros_like(offset), where=scale != 0),
-            **self._thing(
-                motion.object_pos_w[frames] if there else None,
-                motion.object_quat_w[frames] if there else None,
-                motion.object_joint_pos[frames] if motion.object_joint_pos.shape[-1] else None,
-            ),
         )
+        reference = {name: value[frames] for name, value in motion.reference().items()}
+        return self._with_object(now, {name: value for name, value in reference.items() if name.startswith("object_")})
 
 
 def describe(spec: NetworkSpec, kinematics: Kinematics, motion: Motion, where: str) -> Description:

@@ -233,7 +233,7 @@ def write_spec(values: Mapping[str, Any], path: str | Path) -> Path:
 
 
 def per_joint(values: PerJoint, names: Sequence[str], where: str, default: float = 0.0) -> np.ndarray:
-    """A number for each joint: one for all, a list in their order, or by pattern, of which the last that matches counts.
+    """A number for each joint: one for all, a list in their order, or by pattern, of which the last match counts.
 
     Raises:
         PolicyError: for a list of another length, or a pattern that is none or matches nothing.

@@ -68,7 +68,8 @@ class Graph:
         return [np.concatenate(values) for values in zip(*found, strict=True)]
 
     def _run(self, given: Mapping[str, np.ndarray], outputs: Sequence[str]) -> list[np.ndarray]:
-        feed, count = {}, len(next(iter(given.values())))
+        count = len(next(iter(given.values())))
+        feed: dict[str, np.ndarray] = {}
         for name, value in given.items():
             shape = self.inputs[name]
             sizes = [size if isinstance(size, int) else -1 for size in shape[1:]]
@@ -87,6 +88,7 @@ class Observer:
     """
 
     def __init__(self, spec: NetworkSpec, motion: Motion, body_names: Sequence[str], where: str):
+        self.where = where
         self.terms: dict[str, list[Bound]] = {
             name: [bind(term, spec, motion, body_names, f"{where}.inputs.{name}[{i}]") for i, term in enumerate(terms)]
             for name, terms in spec.inputs.items()
@@ -107,9 +109,11 @@ class Observer:
     def _term(self, key: tuple[str, int], term: Bound, now: Moment, fresh: np.ndarray) -> np.ndarray:
         spec, lead = term.spec, now.step.shape
         value = TERMS[spec.term].function(now, term).reshape(*lead, -1)
-        if np.size(spec.scale) not in (1, value.shape[-1]):
+        width = value.shape[-1]
+        if np.size(spec.scale) not in (1, width):
             raise PolicyError(
-                f"{key[0]}[{key[1]}].scale: {np.size(spec.scale)} numbers for the {value.shape[-1]} features of {spec.term}"
+                f"{self.where}.inputs.{key[0]}[{key[1]}].scale: {np.size(spec.scale)} numbers for the {width} features "
+                f"of {spec.term}"
             )
         value = np.clip(value, -spec.clip, spec.clip) * np.asarray(spec.scale)
         depth = max(spec.lags)

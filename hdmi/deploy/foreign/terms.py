@@ -7,7 +7,7 @@ Each says what it is, its shape before lags, unit, and what others call it. F ar
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,10 @@ from hdmi.deploy.description import PolicyError
 from hdmi.deploy.foreign.motion import Motion
 from hdmi.deploy.foreign.schema import Frame, NetworkSpec, TermSpec, one_of, per_joint
 from hdmi.deploy.rotations import matrix_of, quat_apply_inverse, quat_conjugate, quat_multiply, yaw_of
+
+
+def _absent() -> np.ndarray:
+    return np.zeros(0)
 
 
 @dataclass
@@ -38,12 +42,12 @@ class Moment:
     root_lin_vel_w: np.ndarray
     root_ang_vel_b: np.ndarray
     action: np.ndarray
-    object_pos_w: np.ndarray | None = None
-    object_quat_w: np.ndarray | None = None
-    object_joint_pos: np.ndarray | None = None
-    link_pos_w: np.ndarray | None = None
-    link_quat_w: np.ndarray | None = None
-    object_scale: np.ndarray | float = 1.0
+    object_pos_w: np.ndarray = field(default_factory=_absent)
+    object_quat_w: np.ndarray = field(default_factory=_absent)
+    object_joint_pos: np.ndarray = field(default_factory=_absent)
+    link_pos_w: np.ndarray = field(default_factory=_absent)
+    link_quat_w: np.ndarray = field(default_factory=_absent)
+    object_scale: np.ndarray = field(default_factory=lambda: np.ones(1))
 
 
 @dataclass(frozen=True)
@@ -207,14 +211,20 @@ def constant(now: Moment, b: Bound) -> np.ndarray:
 
 @_term("steps joints")
 def ref_joint_pos(now: Moment, b: Bound) -> np.ndarray:
-    """Joint positions of the motion, rad [F, J]; ref_joint_pos_future; the first half of mjlab's command."""
+    """Joint positions of the motion, rad [F, J]; ref_joint_pos_future."""
     return b.motion.joint_pos[b.future(now)][..., b.joints]
 
 
 @_term("steps joints")
 def ref_joint_vel(now: Moment, b: Bound) -> np.ndarray:
-    """Joint velocities of the motion, rad/s [F, J]; the second half of mjlab's command."""
+    """Joint velocities of the motion, rad/s [F, J]; ref_joint_vel_future."""
     return b.motion.joint_vel[b.future(now)][..., b.joints]
+
+
+@_term("steps joints")
+def ref_joint_state(now: Moment, b: Bound) -> np.ndarray:
+    """Joint positions and then velocities of the motion, rad and rad/s [F, 2 J]; mjlab's and BeyondMimic's command."""
+    return np.concatenate([ref_joint_pos(now, b), ref_joint_vel(now, b)], axis=-1)
 
 
 def _bodies_of(table: np.ndarray, now: Moment, b: Bound) -> np.ndarray:
@@ -275,14 +285,12 @@ def _turned(quat: np.ndarray, b: Bound) -> np.ndarray:
 @_term("frame axes max_norm", "pos object_pos_w")
 def object_pos(now: Moment, b: Bound) -> np.ndarray:
     """Position of the object, m [3]; object_pos_b, with axes [0, 1] object_xy_b."""
-    assert now.object_pos_w is not None
     return b.positions(now, now.object_pos_w[..., None, :])
 
 
 @_term("frame rotation", "quat object_quat_w")
 def object_ori(now: Moment, b: Bound) -> np.ndarray:
     """Orientation of the object, [R]; object_ori_b, with rotation heading object_heading_b."""
-    assert now.object_quat_w is not None
     return b.rotations(now, now.object_quat_w[..., None, :])
 
 
@@ -295,7 +303,6 @@ def object_pose(now: Moment, b: Bound) -> np.ndarray:
 @_term("points frame max_norm", "pos object_pos_w object_quat_w")
 def object_points(now: Moment, b: Bound) -> np.ndarray:
     """Points that are fixed in the object, m [K, 3]; authors' deployment: ref_contact_pos_b."""
-    assert now.object_pos_w is not None and now.object_quat_w is not None
     quat = np.broadcast_to(now.object_quat_w[..., None, :], (*now.step.shape, len(b.spec.points), 4))
     return b.positions(now, now.object_pos_w[..., None, :] + _turned(quat, b))
 
@@ -309,7 +316,6 @@ def object_corners(now: Moment, b: Bound) -> np.ndarray:
 @_term("", "object_joint_pos")
 def object_joint_pos(now: Moment, b: Bound) -> np.ndarray:
     """Angle of the object's hinge, rad [1]."""
-    assert now.object_joint_pos is not None
     return now.object_joint_pos
 
 
@@ -328,9 +334,8 @@ def ref_object_ori(now: Moment, b: Bound) -> np.ndarray:
 @_term("bodies frame max_norm", "pos object_pos_w object_quat_w")
 def contact_points(now: Moment, b: Bound) -> np.ndarray:
     """The motion's contact points on the object, where that is measured to be, m [K, 3]; ref_contact_pos_b."""
-    assert now.link_pos_w is not None and now.link_quat_w is not None
     points = b.motion.contact_points[np.clip(now.step, 0, b.motion.num_frames - 1)][..., b.contacts, :]
-    points = points * np.asarray(now.object_scale)[..., None]
+    points = points * now.object_scale[..., None]
     quat = np.broadcast_to(quat_conjugate(now.link_quat_w)[..., None, :], (*points.shape[:-1], 4))
     return b.positions(now, now.link_pos_w[..., None, :] + quat_apply_inverse(quat, points))
 
