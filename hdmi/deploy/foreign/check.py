@@ -134,8 +134,9 @@ def _affine(graph: Any, name: str, constants: Callable[[str], Any]) -> tuple[Any
     other = constants(node.input[1] if first else node.input[0])
     if other is None or (not first and node.op_type in ("Sub", "Div")):
         return None
-    steps = {"Sub": (1.0, -other), "Add": (1.0, other), "Mul": (other, 0.0), "Div": (1.0 / other, 0.0)}
-    return *steps[node.op_type], node.output[0]
+    if node.op_type in ("Mul", "Div"):
+        return other if node.op_type == "Mul" else np.reciprocal(other), 0.0, node.output[0]
+    return 1.0, other if node.op_type == "Add" else -other, node.output[0]
 
 
 class _Constants:
