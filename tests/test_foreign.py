@@ -665,8 +665,8 @@ def test_our_own_terms_have_names(own: tuple[Path, Any, Any, Any]):
     _, _, task, (graph, *_) = own
     names = [term["term"] for term in own_terms(graph, task)]
     assert names == [
-        "phase", "ref_joint_pos", "ref_body_pos", "root_ang_vel", "gravity", "joint_pos_rel", "joint_vel", "last_action",
-        "ref_body_pose", "object_pose", "contact_points", "contact",
+        "phase", "ref_joint_pos", "ref_body_pos", "root_ang_vel", "gravity", "joint_pos_rel", "joint_vel",
+        "last_action", "ref_body_pose", "object_pose", "contact_points", "contact",
     ]  # fmt: skip
     renamed = dict(graph.stages)["observation.policy.gravity"]
     before = renamed.in_keys
@@ -688,7 +688,7 @@ def test_the_trainer_s_worlds_get_the_same_targets(own: tuple[Path, Any, Any, An
     policy = ForeignPolicy(folder / "policy.yaml")
     foreign_cfg = foreign_config(cfg, policy, task)
     envs = env, make_env(foreign_cfg, 2, task)
-    runs = lambda td: td.set("action", network_of(actor)(td["policy"])[0]), ForeignActor(policy, task)  # noqa: E731
+    runs = lambda td: td.set("action", network_of(actor)(td["policy"])[0]), ForeignActor(policy, task)
     states = [env.reset() for env in envs]
     with torch.no_grad():
         for _ in range(6):
@@ -710,10 +710,9 @@ def test_a_policy_of_another_motion_is_refused(own: tuple[Path, Any, Any, Any], 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["lift_box", "walk", "open_foldchair_sit"])
-def test_exported_policies_and_their_descriptions_agree(name: str, tmp_path: Path, public_motions: Path):
+def test_exported_policies_and_their_descriptions_agree(name: str, tmp_path: Path):
     from hdmi.deploy.export import export_graph
 
-    assert public_motions
     export_graph(ROOT / "zoo" / name, tmp_path)
     graph, policy = Policy(tmp_path), ForeignPolicy(tmp_path / "policy.yaml")
     assert set(graph.sensors) == set(policy.sensors)

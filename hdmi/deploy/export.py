@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 import hdmi
 from hdmi.assembly import Task, make_env, make_task, make_transforms
-from hdmi.deploy.foreign.own import SPEC_FILE, write_own
-from hdmi.deploy.format import FORMAT, GRAPH_FILE, REFERENCE_FILE, SCENE_FILE, SENSORS, DeploymentError
+from hdmi.deploy.foreign.own import write_own
+from hdmi.deploy.format import FORMAT, GRAPH_FILE, REFERENCE_FILE, SCENE_FILE, SENSORS, SPEC_FILE, DeploymentError
 from hdmi.deploy.graph import UNMEASURED, Measured, PolicyGraph, name_of
 from hdmi.deploy.rotations import tilt_of
 from hdmi.deploy.trace import trace
@@ -180,7 +180,7 @@ def metadata_of(cfg: DictConfig, graph: PolicyGraph, task: Task) -> dict[str, st
         "root_lin_vel_w": reference.body_lin_vel[0, 0].numpy(),
         "root_ang_vel_w": reference.body_ang_vel[0, 0].numpy(),
     }
-    known, unchecked = _terminations(cfg)
+    trial = trial_of(cfg, task)
     inputs = {name: {"shape": list(shape)} | SENSORS[name] for name, shape in graph.measured.sensors.items()}
     return {
         "format": FORMAT,
@@ -208,12 +208,12 @@ def metadata_of(cfg: DictConfig, graph: PolicyGraph, task: Task) -> dict[str, st
         "state": json.dumps({name.removeprefix("state."): value.tolist() for name, value in _state(graph).items()}),
         "start": json.dumps({name: value.tolist() for name, value in start.items()}),
         "max_tilt": str(float(tilt_of(arrays["root_quat_w"]).max())),
-        "start_noise": json.dumps(_start_noise(cfg, reference)),
-        "tracked_joints": ",".join(_matching(cfg, "joints", robot.joint_names)),
-        "tracked_bodies": ",".join(_matching(cfg, "bodies", robot.body_names)),
-        "object_joint": json.dumps(_object_joint(cfg)),
-        "terminations": json.dumps(known),
-        "unchecked_terminations": ",".join(unchecked),
+        "start_noise": json.dumps(trial["start_noise"]),
+        "tracked_joints": ",".join(trial["tracked_joints"]),
+        "tracked_bodies": ",".join(trial["tracked_bodies"]),
+        "object_joint": json.dumps(trial["object_joint_ranges"]),
+        "terminations": json.dumps(trial["terminations"]),
+        "unchecked_terminations": ",".join(trial["unchecked"]),
         "quaternions": "wxyz",
     }
 

@@ -11,6 +11,7 @@ FORMAT = "hdmi-policy/1"
 GRAPH_FILE = "policy.onnx"
 SCENE_FILE = "scene.xml"
 REFERENCE_FILE = "reference.npz"
+NETWORK_FILE, SPEC_FILE, MOTION_FOLDER = "network.onnx", "policy.yaml", "motion"  # for other runners
 TARGET = "joint_pos_target"  # rad, [J]
 
 # World frame, quaternions wxyz, SI units.

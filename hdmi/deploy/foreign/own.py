@@ -16,7 +16,7 @@ from torchrl.envs import Transform
 from hdmi.assembly import Task
 from hdmi.assets import Scene
 from hdmi.deploy.foreign.schema import write_spec
-from hdmi.deploy.format import SCENE_FILE, DeploymentError
+from hdmi.deploy.format import MOTION_FOLDER, NETWORK_FILE, SCENE_FILE, SPEC_FILE, DeploymentError
 from hdmi.deploy.graph import PolicyGraph, name_of
 from hdmi.deploy.trace import trace
 from hdmi.motion import Motion, save_motion
@@ -30,7 +30,6 @@ from hdmi.transforms import (
     ResidualAction,
 )
 
-NETWORK_FILE, SPEC_FILE, MOTION_FOLDER = "network.onnx", "policy.yaml", "motion"
 _Maker = Callable[[PolicyGraph, Transform, Task], dict[str, Any]]
 
 
