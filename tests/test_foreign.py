@@ -581,6 +581,17 @@ def test_a_network_without_normalization_is_not_judged(tmp_path: Path, capsys: p
     assert "no means and deviations" in capsys.readouterr().out
 
 
+def test_the_documentation_has_every_key_and_term():
+    from dataclasses import fields
+
+    from hdmi.deploy.foreign.schema import Action, Frame, NetworkSpec, TermSpec
+
+    text = (ROOT / "docs" / "foreign.md").read_text(encoding="utf-8")
+    names = [item.name for part in (NetworkSpec, Action, TermSpec) for item in fields(part)]
+    assert not [name for name in (*names, *TERMS, *ROTATIONS) if f"`{name}`" not in text]
+    assert all(item.name in text for item in fields(Frame))
+
+
 # -- the runner, without the trainer --------------------------------------------------------------------------
 
 WITHOUT_TRAINER = """
@@ -696,6 +707,13 @@ def test_the_trainer_s_worlds_get_the_same_targets(own: tuple[Path, Any, Any, An
             states = [env.step_mdp(td) for env, td in zip(envs, stepped, strict=True)]
             reached = [env.base_env._state(slice(None))["robot", "joint_target"] for env in envs]
             assert reached[1] == pytest.approx(reached[0], abs=1e-4)
+
+
+def test_an_evaluation_needs_a_task(capsys: pytest.CaptureFixture[str]):
+    assert command("evaluate").main(["policy=policy.yaml"]) == 2
+    assert "give task=NAME, in whose environment" in capsys.readouterr().err
+    assert command("evaluate").main(["policy=/nowhere/policy.yaml", "task=walk"]) == 2
+    assert "PolicyError: /nowhere/policy.yaml: there is no such file" in capsys.readouterr().err
 
 
 def test_a_policy_of_another_motion_is_refused(own: tuple[Path, Any, Any, Any], tmp_path: Path):

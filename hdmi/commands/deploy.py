@@ -30,7 +30,6 @@ from hdmi.console import make_console
 from hdmi.deploy import runner, safety
 from hdmi.deploy.controls import Controls, Gamepad, Keyboard
 from hdmi.deploy.description import PolicyError
-from hdmi.deploy.foreign.policy import ForeignPolicy
 from hdmi.deploy.log import LogError, read_log, replay
 from hdmi.deploy.policy import Policy
 from hdmi.deploy.robot import RobotError
@@ -39,6 +38,7 @@ from hdmi.errors import ConfigError
 
 # Modules of hdmi.deploy.robots.
 ROBOTS = ("mujoco",)
+YAML = (".yaml", ".yml")  # of descriptions
 TOLERANCE = 1e-4  # rad that a replayed target may be off: another machine, another rounding
 
 
@@ -91,7 +91,7 @@ def run(arguments: list[str], console: Console) -> int:
         return _replay(options, policy, console)
     if module is None:
         raise ConfigError(f"give robot=NAME, one of {', '.join(ROBOTS)}, or replay=LOG")
-    files = policy.scene if isinstance(policy, ForeignPolicy) else policy.path.parent
+    files = policy.scene if policy.path.suffix in YAML else policy.path.parent
     robot = module.connect(policy.description, files, values[module.Options])
     try:
         if options.episodes > 0:
@@ -101,21 +101,21 @@ def run(arguments: list[str], console: Console) -> int:
         robot.close()
 
 
-def _policy(path: str) -> Policy | ForeignPolicy:
-    """An exported policy, or what a YAML describes."""
-    return ForeignPolicy(path) if path.endswith((".yaml", ".yml")) else Policy(path)
+def _policy(path: str) -> Any:
+    """An exported policy, or what a YAML describes, which has its interface."""
+    if not path.endswith(YAML):
+        return Policy(path)
+    from hdmi.deploy.foreign.policy import ForeignPolicy  # needs PyYAML
+
+    return ForeignPolicy(path)
 
 
-def _reference(policy: Policy | ForeignPolicy) -> dict[str, np.ndarray]:
+def _reference(policy: Any) -> dict[str, np.ndarray]:
     """The policy's motion."""
-    if isinstance(policy, ForeignPolicy):
-        return policy.reference
-    return read_reference(policy.path.parent, policy.description)
+    return policy.reference if policy.path.suffix in YAML else read_reference(policy.path.parent, policy.description)
 
 
-def _drive(
-    options: Options, values: dict[type, Any], policy: Policy | ForeignPolicy, robot: Any, console: Console
-) -> int:
+def _drive(options: Options, values: dict[type, Any], policy: Policy, robot: Any, console: Console) -> int:
     """One run through all states."""
     controls: list[Controls] = []
     try:
@@ -138,9 +138,7 @@ def _drive(
     return 0 if drive.failure is None else 130 if drive.failure == "interrupted" else 1
 
 
-def _episodes(
-    options: Options, values: dict[type, Any], policy: Policy | ForeignPolicy, robot: Any, console: Console
-) -> int:
+def _episodes(options: Options, values: dict[type, Any], policy: Policy, robot: Any, console: Console) -> int:
     """Episodes of a simulated robot, and their figures; log and plot are of the last."""
     from hdmi.deploy.robots.mujoco import MujocoRobot
     from hdmi.deploy.trial import Judge, Result
@@ -168,7 +166,7 @@ def _episodes(
     return 0
 
 
-def results_table(results: list[Any], policy: Policy | ForeignPolicy) -> Table:
+def results_table(results: list[Any], policy: Policy) -> Table:
     """Figures of episodes."""
     from hdmi.deploy.trial import UNITS, summarize
 
@@ -197,7 +195,7 @@ def _counts(drive: Any) -> str:
     return f"{len(ms)} ticks, {ms.mean():.2f} ms each (99 %: {np.percentile(ms, 99):.2f}); {counts}"
 
 
-def _finish(options: Options, drive: Any, policy: Policy | ForeignPolicy) -> None:
+def _finish(options: Options, drive: Any, policy: Policy) -> None:
     if options.log is not None:
         print(options.log)
     if options.plot is not None:
@@ -207,7 +205,7 @@ def _finish(options: Options, drive: Any, policy: Policy | ForeignPolicy) -> Non
         print(plot_log(header, drive.log.arrays(), policy.description, options.plot, _shown_reference(policy)))
 
 
-def _shown_reference(policy: Policy | ForeignPolicy) -> dict[str, np.ndarray] | None:
+def _shown_reference(policy: Policy) -> dict[str, np.ndarray] | None:
     """The motion to draw, if it is there."""
     try:
         return _reference(policy)
@@ -215,7 +213,7 @@ def _shown_reference(policy: Policy | ForeignPolicy) -> dict[str, np.ndarray] | 
         return None
 
 
-def _replay(options: Options, policy: Policy | ForeignPolicy, console: Console) -> int:
+def _replay(options: Options, policy: Policy, console: Console) -> int:
     """The graph over a log's sensors."""
     assert options.replay is not None
     header, arrays = read_log(options.replay)

@@ -81,7 +81,8 @@ def _graph_lines(folder: Path) -> list[str]:
     return [
         f"`{GRAPH_FILE}` is the policy with its observations and actions as one graph, from sensors to joint position "
         f"targets ({size} MB); `{SCENE_FILE}` is the scene that it was trained in."
-        + f" `{SPEC_FILE}` describes the network alone, `{NETWORK_FILE}`, for other runners." * described,
+        + f" `{SPEC_FILE}` describes the network alone, `{NETWORK_FILE}`, for other runners."
+        * described,
         "",
     ]
 
