@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -320,7 +320,8 @@ def test_wrong_sensors_and_results_are_named(tmp_path: Path):
 METADATA = {
     "joint_names": "knee,hip", "joint_stiffness": "40.000,50.000", "joint_damping": "1.000,2.000",
     "default_joint_pos": "0.500,0.100", "command_names": "motion", "action_scale": "0.250,0.500",
-    "observation_names": "command,motion_anchor_pos_b,motion_anchor_ori_b,base_lin_vel,base_ang_vel,joint_pos,joint_vel,actions",
+    "observation_names": "command,motion_anchor_pos_b,motion_anchor_ori_b,base_lin_vel,base_ang_vel,joint_pos,joint_vel,"
+    "actions",
     "anchor_body_name": "thigh", "body_names": "thigh,pelvis",
 }  # fmt: skip
 
@@ -406,7 +407,9 @@ def test_yaml_and_json_of_the_authors(tmp_path: Path):
             "root_ang_vel_history": {"history_steps": [0], "noise_std": 0.05},
             "joint_pos_history": {"history_steps": [0, 2]},
             "prev_actions": {"steps": 3},
-            "ref_contact_pos_b": {"object_name": "box", "contact_target_pos_offset": [[0.0, -0.15, 0.8]], "yaw_only": True},
+            "ref_contact_pos_b": {
+                "object_name": "box", "contact_target_pos_offset": [[0.0, -0.15, 0.8]], "yaw_only": True,
+            },
         },
     }  # fmt: skip
     about = {
@@ -484,7 +487,7 @@ _TERMS = [{"term": "joint_pos"}]
         ({"joints": None}, "policy.yaml.joints: expected a list, got None"),
         ({"control_dt": "fast"}, "policy.yaml.control_dt: expected a number, got 'fast'"),
         ({"format": "hdmi-network/9"}, "this version reads 'hdmi-network/1'"),
-        ({"inputs": {"obs": [{"term": "joint_poss"}]}}, "inputs.obs[0]: there is no 'joint_poss' (did you mean joint_pos?)"),
+        ({"inputs": {"obs": [{"term": "joint_poss"}]}}, "obs[0]: there is no 'joint_poss' (did you mean joint_pos?)"),
         ({"inputs": {"obs": [{"term": "phase", "joints": ["hip"]}]}}, "phase takes no joints; it takes clip, fill"),
         ({"inputs": {"obs": [{"term": "joint_pos", "joints": ["hipp"]}]}}, "there is no 'hipp' (did you mean hip?)"),
         ({"inputs": {"obs": [{"term": "body_pos", "bodies": ["head"]}]}}, "no 'head'; there is pelvis, thigh, shin"),
@@ -495,7 +498,7 @@ _TERMS = [{"term": "joint_pos"}]
         ),
         ({"inputs": {"observation": _TERMS}}, "network.onnx: there is no 'observation'; there is obs"),
         ({"inputs": {"obs": [_TERMS[0] | {"scale": [1, 2, 3]}]}}, "inputs.obs[0].scale: 3 numbers for the 2 features"),
-        ({"action": {"base": "default", "joints": ["hip"]}}, "action: 1 joints, and the network's actions has 2 numbers"),
+        ({"action": {"base": "default", "joints": ["hip"]}}, "1 joints, and the network's actions has 2 numbers"),
         ({"action": {"base": "defualt"}}, "action.base: there is no 'defualt' (did you mean default?)"),
         ({"joints": ["hip", "ankle"], "default_pose": 0.0}, "scene.xml: has no joint ankle; it has hip, knee"),
         ({"damping": {"elbow": 1.0}}, "damping: 'elbow' matches none of hip, knee"),
@@ -506,7 +509,10 @@ _TERMS = [{"term": "joint_pos"}]
         ({"object": "crate"}, "motion.npz: has no body 'crate', the object; it has pelvis, box"),
         ({"control_dt": 0.01}, "fps 50, and the policy has control steps of 0.01 s"),
         ({"tracked_bodies": ["head"]}, "tracked_bodies: there is no head"),
-        ({"inputs": {"obs": [{"term": "object_joint_pos"}, {"term": "phase"}]}}, "object_joint_pos: depends on object_joint_pos"),
+        (
+            {"inputs": {"obs": [{"term": "object_joint_pos"}, {"term": "phase"}]}},
+            "policy.yaml: object_joint_pos: depends on object_joint_pos, of an object",
+        ),
     ],
 )  # fmt: skip
 def test_mistakes_are_one_line(changes: dict[str, Any], text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
