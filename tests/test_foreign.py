@@ -320,8 +320,8 @@ def test_wrong_sensors_and_results_are_named(tmp_path: Path):
 METADATA = {
     "joint_names": "knee,hip", "joint_stiffness": "40.000,50.000", "joint_damping": "1.000,2.000",
     "default_joint_pos": "0.500,0.100", "command_names": "motion", "action_scale": "0.250,0.500",
-    "observation_names": "command,motion_anchor_pos_b,motion_anchor_ori_b,base_lin_vel,base_ang_vel,joint_pos,joint_vel,"
-    "actions",
+    "observation_names": "command,motion_anchor_pos_b,motion_anchor_ori_b,base_lin_vel,base_ang_vel,joint_pos,"
+    "joint_vel,actions",
     "anchor_body_name": "thigh", "body_names": "thigh,pelvis",
 }  # fmt: skip
 
