@@ -26,7 +26,7 @@ install: $(STAMP) ## create .venv and install the package with its tools
 $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -c constraints.txt '$(TORCH)'
-	$(BIN)/python -m pip install -c constraints.txt -e '.[dev,docs,retarget,viewer,gpu,ray,cluster,deploy]'
+	$(BIN)/python -m pip install -c constraints.txt -e '.[dev,docs,retarget,viewer,gpu,ray,cluster,deploy,robot]'
 	touch $@
 
 format: $(STAMP) ## format the code and fix what ruff can fix

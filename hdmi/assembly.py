@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import mujoco
+import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 from tensordict import NestedKey
@@ -29,6 +31,7 @@ from hdmi.config import ConfigError, build, build_dataclass, one_line, plain_con
 from hdmi.envs import HumanoidObjectEnv, MaskedResetEnv, PhysicsBackend, ResetEnv, RowResetEnv
 from hdmi.envs.resets import check_row_resets
 from hdmi.motion import Reference, find_motion, make_reference
+from hdmi.motion.dynamics import reference_torque
 from hdmi.motion.starts import StartTables, start_tables
 from hdmi.order import check_order, check_reads, listed_keys, read_keys
 from hdmi.transforms import KernelReward, KernelTermination
@@ -64,6 +67,11 @@ class Task:
     scene: Scene
     reference: Reference
     starts: StartTables | None = None
+
+    @cached_property
+    def joint_torque(self) -> torch.Tensor:
+        """What the reference asks of the joints, N m, see `hdmi.motion.dynamics`. [T, J]"""
+        return torch.from_numpy(reference_torque(self.scene, self.reference)).float()
 
 
 def scene_parts(cfg: DictConfig) -> dict[str, Any]:
@@ -243,8 +251,12 @@ def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
         "feet": robot.foot_bodies,
         "robot_mass": robot.total_mass,
         "default_pos": robot.default_joint_pos,
+        "servo_stiffness": robot.stiffness,
+        "servo_damping": robot.damping,
         "reference": task.reference,
         "starts": task.starts,
+        "total_steps": cfg.total_frames // cfg.num_envs,
+        "joint_torque": lambda: task.joint_torque,  # a second of work that only some stacks need
         "model": task.scene.model,
         "robot_bodies": task.scene.body_ids.tolist(),
         "effectors": task.scene.effectors,

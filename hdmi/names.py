@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from tensordict import NestedKey
 
 FRAME_KEY: NestedKey = ("init", "frame")  # where an episode starts, int64 [N, 1]
+REWIND_KEY: NestedKey = ("init", "rewind_frame")  # likewise, negative where it is to be drawn
 NOISE_SHARE_KEY: NestedKey = ("init", "noise_share")  # factor of a start's perturbations, [N, 1]
 
 

@@ -29,6 +29,7 @@ from hdmi.transforms import (
     ResidualAction,
     RewardRate,
     RewardTerm,
+    Rewind,
     TerminationTerm,
     UniformNoise,
 )
@@ -158,6 +159,11 @@ RULES: tuple[Rule, ...] = (
         _is(ReferenceStateInitialization),
         _is(ObjectScale),
         "resets go through the stack from last to first, and starts have to know the size that is drawn",
+    ),
+    Before(
+        _is(ReferenceStateInitialization),
+        _is(Rewind),
+        "resets go through the stack from last to first, and starts have to know the frame that is chosen",
     ),
     Before(
         _drawn_per("episode"),

@@ -12,8 +12,10 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 from hydra.core.hydra_config import HydraConfig
 from hypothesis import settings
+from mocks import load_config
 
 from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene, default_joint_pos, g1, g1_robot
 from hdmi.motion import forward_kinematics
@@ -112,3 +114,37 @@ def pose() -> Callable[..., mujoco.MjData]:
         return data
 
     return make
+
+
+@pytest.fixture(scope="session")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of lift_box with untrained weights: its targets are close to the motion. One for all test processes."""
+    pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder = shared / "exported"
+    with FileLock(shared / "exported.lock"):
+        if not folder.is_dir():
+            partial = tmp_path_factory.mktemp("partial")
+            export_untrained(partial)
+            partial.rename(folder)
+    return folder
+
+
+def export_untrained(folder: Path) -> None:
+    """Exports lift_box with weights that are drawn at random."""
+    from hdmi.assembly import make_env, make_task
+    from hdmi.deploy.export import make_graph, write_graph
+    from hdmi.learning.networks import make_actor
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hdmi.assembly.start_tables", lambda *_: None)  # they take seconds
+        cfg = load_config("task=lift_box")
+        task = make_task(cfg)
+        env = make_env(cfg, 1, task)
+        sizes = env.full_observation_spec["policy"].shape[-1], env.action_spec.shape[-1]
+        torch.manual_seed(0)
+        actor = make_actor(*sizes, hidden=[32], activation="SiLU", init_noise=0.1, bf16=False)
+        graph, task = make_graph(cfg, actor, task)
+        write_graph(cfg, graph, task, folder)

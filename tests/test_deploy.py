@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from mocks import command, load_config
+from mocks import command
 
 from hdmi import functional as F
 from hdmi.deploy import rotations
@@ -576,27 +576,6 @@ def test_shielded_actions_are_all_done():
 # -- an exported policy ---------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="session")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of lift_box with untrained weights: its targets are close to the motion."""
-    from hdmi.assembly import make_env, make_task
-    from hdmi.deploy.export import make_graph, write_graph
-    from hdmi.learning.networks import make_actor
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hdmi.assembly.start_tables", lambda *_: None)  # they take seconds
-        cfg = load_config("task=lift_box")
-        task = make_task(cfg)
-        env = make_env(cfg, 1, task)
-        sizes = env.full_observation_spec["policy"].shape[-1], env.action_spec.shape[-1]
-        torch.manual_seed(0)
-        actor = make_actor(*sizes, hidden=[32], activation="SiLU", init_noise=0.1, bf16=False)
-        graph, task = make_graph(cfg, actor, task)
-        folder = tmp_path_factory.mktemp("exported")
-        write_graph(cfg, graph, task, folder)
-    return folder
-
-
 @pytest.fixture
 def changed(exported: Path, tmp_path: Path) -> Callable[..., Path]:
     """The exported policy with other metadata; None takes an entry away."""
@@ -924,7 +903,7 @@ def test_all_states_in_simulation(exported: Path, tmp_path: Path, capsys: pytest
     ("arguments", "text"),
     [
         (["robot=mujoco"], "ConfigError: give policy=FOLDER"),
-        (["policy={}"], "ConfigError: give robot=NAME, one of mujoco"),
+        (["policy={}"], "ConfigError: give robot=NAME, one of mujoco, unitree"),
         (["policy={}", "robot=asimo"], "ConfigError: robot: expected one of mujoco"),
         (["policy={}", "robot=mujoco", "epsodes=3"], "ConfigError: unknown option 'epsodes' (did you mean episodes?)"),
         (["policy={}", "robot=mujoco", "mocap_latency=far"], "ConfigError: mocap_latency: a number expected"),

@@ -19,7 +19,6 @@ from hdmi.motion import Motion, find_motion, forward_kinematics, load_motion, ma
 from hdmi.motion.format import motion_from_poses
 from hdmi.motion.kinematics import derivative
 from hdmi.workshop.validate import LIMITS, Limit, Series, judge, validate_motion
-from hdmi.workshop.validate.checks import ground_gap
 
 FPS, T = 50.0, 60
 PELVIS = g1.BODY_NAMES.index("pelvis")
@@ -279,10 +278,10 @@ class TestObject:
         box = ObjectConfig("box", [{"box": (0.3, 0.3, 0.1)}])
         for lift, gap in ((0.2, 0.0), (0.23, 0.03)):
             playback = make_playback(with_box(moved(z=lift), box_pos), object=box)
-            assert ground_gap(playback) == pytest.approx(gap, abs=1e-3)
+            assert playback.ground_gap == pytest.approx(gap, abs=1e-3)
         # what is carried is no ground
         playback = make_playback(with_box(moved(z=0.2), box_pos + np.array([0, 0, 0.05])), object=box)
-        assert ground_gap(playback) == pytest.approx(0.2, abs=1e-3)
+        assert playback.ground_gap == pytest.approx(0.2, abs=1e-3)
 
     def test_label_before_the_hands_arrive(self, lift_box):
         motion, scene = lift_box

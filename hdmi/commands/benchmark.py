@@ -40,7 +40,7 @@ from hdmi.commands.script import run_composed
 from hdmi.config import CONF
 from hdmi.console import make_console
 from hdmi.envs import BatchBackend
-from hdmi.learning import Trainer
+from hdmi.learning import make_trainer
 from hdmi.threads import torch_threads
 
 _BLOCKS, _STEPS, _ITERATIONS = 7, 20, 4
@@ -199,7 +199,7 @@ def part_times(result: dict[str, Any]) -> Table:
 def _composed(cfg: DictConfig) -> None:
     console = make_console()
     with tempfile.TemporaryDirectory() as folder:
-        trainer = Trainer(cfg, Path(folder))
+        trainer = make_trainer(cfg, Path(folder))
         env, policy = trainer.env, trainer.actor
         if env.base_env.num_envs != cfg.num_envs:  # workers simulate a share each
             env = make_env(cfg, task=trainer.task)

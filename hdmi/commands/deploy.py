@@ -1,7 +1,7 @@
 """Runs an exported policy on a robot, real or simulated, without the trainer: needs neither torch nor hydra.
 
     hdmi deploy policy=FOLDER robot=mujoco [episodes=50] [log=FILE.npz] [plot=FILE.png] ...
-    hdmi deploy policy=FOLDER robot=NAME auto=false log=FILE.npz  # keys: s to the start, r run, h hold, space damping
+    hdmi deploy policy=FOLDER robot=unitree interface=eth0 log=FILE.npz  # keys: s start, r run, h hold, space damping
     hdmi deploy policy=FOLDER replay=FILE.npz [plot=FILE.png]         # the graph over logged sensors
 
 Instead of a folder, FILE.yaml: what describes a network of others, or that of `hdmi export` in the same words.
@@ -17,27 +17,26 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, make_dataclass, replace
+from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any, get_type_hints
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hdmi.commands.options import parse_options
-from hdmi.console import make_console
+from hdmi.commands.deployed import run_deployed
+from hdmi.commands.options import parse_parts, shown_help
 from hdmi.deploy import runner, safety
 from hdmi.deploy.controls import Controls, Gamepad, Keyboard
 from hdmi.deploy.description import PolicyError
-from hdmi.deploy.log import LogError, read_log, replay
+from hdmi.deploy.log import read_log, replay
 from hdmi.deploy.policy import Policy
-from hdmi.deploy.robot import RobotError
 from hdmi.deploy.trial import read_reference
 from hdmi.errors import ConfigError
 
 # Modules of hdmi.deploy.robots.
-ROBOTS = ("mujoco",)
+ROBOTS = ("mujoco", "unitree")
 YAML = (".yaml", ".yml")  # of descriptions
 TOLERANCE = 1e-4  # rad that a replayed target may be off: another machine, another rounding
 
@@ -67,18 +66,8 @@ def _parse(arguments: Sequence[str]) -> tuple[Options, dict[type, Any], Any]:
     chosen = [argument.partition("=")[2] for argument in arguments if argument.startswith("robot=")]
     module = _module(chosen[-1]) if chosen else None
     parts = [Options, runner.Options, safety.Limits] + ([] if module is None else [module.Options])
-    everything: Any = parse_options(_merged(parts), arguments)
-    values = {part: part(**{f.name: getattr(everything, f.name) for f in fields(part)}) for part in parts}
+    values = parse_parts(parts, arguments)
     return values[Options], values, module
-
-
-def _merged(parts: Sequence[type]) -> type:
-    """One dataclass of all options; what two parts call the same is the same."""
-    found: dict[str, tuple[str, Any, Any]] = {}
-    for part in parts:
-        hints = get_type_hints(part)
-        found |= {f.name: (f.name, hints[f.name], f) for f in fields(part)}
-    return make_dataclass("DeployOptions", found.values())
 
 
 def run(arguments: list[str], console: Console) -> int:
@@ -131,6 +120,8 @@ def _drive(options: Options, values: dict[type, Any], policy: Policy, robot: Any
     finally:
         for source in controls:
             source.close()
+        for remark in robot.remarks():
+            print(remark, file=sys.stderr)
     console.print(_counts(drive), markup=False)
     _finish(options, drive, policy)
     if drive.failure is not None:
@@ -233,27 +224,10 @@ def _replay(options: Options, policy: Policy, console: Console) -> int:
 
 def _help() -> str:
     """The module's text, with the options of runner, limits and robots."""
-    lines = []
-    for title, part in (
-        ("runner", runner.Options),
-        ("limits", safety.Limits),
-        *((f"robot={name}", _module(name).Options) for name in ROBOTS),
-    ):
-        shown = " ".join(f"{f.name}={f.default}" for f in fields(part))
-        lines.append(f"\n{title}: {shown}")
-    return (__doc__ or "").replace("{options}", "Options and their defaults:\n" + "\n".join(lines))
+    robots = {f"robot={name}": _module(name).Options for name in ROBOTS}
+    return shown_help(__doc__, {"runner": runner.Options, "limits": safety.Limits} | robots)
 
 
 def main(arguments: list[str]) -> int:
     """Runs the command; returns its exit status: 2 after a mistake, 1 when the run failed, 130 when interrupted."""
-    if arguments in (["-h"], ["--help"]):
-        print(_help())
-        return 0
-    try:
-        return run(arguments, make_console())
-    except (ConfigError, PolicyError, RobotError, LogError, ImportError, OSError) as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 130
+    return run_deployed(run, arguments, _help)

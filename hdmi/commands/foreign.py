@@ -20,9 +20,8 @@ from pathlib import Path
 
 from rich.console import Console
 
+from hdmi.commands.deployed import run_deployed
 from hdmi.commands.options import parse_options
-from hdmi.console import make_console
-from hdmi.deploy.description import PolicyError
 from hdmi.deploy.foreign.check import check_table, check_terms
 from hdmi.deploy.foreign.policy import ForeignPolicy
 from hdmi.deploy.foreign.readers import read_foreign
@@ -108,11 +107,4 @@ def write_task(options: Options) -> Path:
 
 def main(arguments: list[str]) -> int:
     """Runs the command; returns its exit status: 2 after a mistake."""
-    if arguments in (["-h"], ["--help"]):
-        print(__doc__)
-        return 0
-    try:
-        return run(arguments, make_console(170))
-    except (ConfigError, PolicyError, ImportError, OSError) as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return 2
+    return run_deployed(run, arguments, lambda: str(__doc__))

@@ -9,8 +9,8 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, make_dataclass
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -40,6 +40,26 @@ def parse_options(cls: type[T], arguments: Sequence[str]) -> T:
             raise ConfigError(_unknown(cls, key))
         values[key] = _convert(types[key], text, key)
     return cls(**values)
+
+
+def parse_parts(parts: Sequence[type], arguments: Sequence[str]) -> dict[type, Any]:
+    """Options of several dataclasses at once, by the class; what two of them call the same is the same.
+
+    Raises:
+        ConfigError: as `parse_options`.
+    """
+    found: dict[str, tuple[str, Any, Any]] = {}
+    for part in parts:
+        hints = get_type_hints(part)
+        found |= {f.name: (f.name, hints[f.name], f) for f in fields(part)}
+    everything: Any = parse_options(make_dataclass("Options", found.values()), arguments)
+    return {part: part(**{f.name: getattr(everything, f.name) for f in fields(part)}) for part in parts}
+
+
+def shown_help(doc: str | None, parts: Mapping[str, type]) -> str:
+    """A command's help, with titled options and their defaults for `{options}`."""
+    lines = [f"{title}: " + " ".join(f"{k}={v}" for k, v in vars(part()).items()) for title, part in parts.items()]
+    return (doc or "").replace("{options}", "Options and their defaults:\n\n" + "\n\n".join(lines))
 
 
 def parse_motion_options(cls: type[T], arguments: Sequence[str]) -> tuple[Path, T]:

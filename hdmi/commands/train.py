@@ -26,10 +26,10 @@ from hdmi.console import make_console
 from hdmi.envs.rendering import RenderingError
 from hdmi.evaluation import evaluate_checkpoint, render_checkpoint
 from hdmi.evaluation.protocol import training_figures
+from hdmi.learning import make_trainer
 from hdmi.learning.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from hdmi.learning.logger import RunLogger
 from hdmi.learning.resume import KEPT, continued_config, differences, find_run
-from hdmi.learning.trainer import Trainer
 
 
 def train(cfg: DictConfig) -> None:
@@ -37,7 +37,7 @@ def train(cfg: DictConfig) -> None:
     console = make_console()
     try:
         cfg, folder, notes = open_run(cfg)
-        trainer = Trainer(cfg, folder, training_figures)
+        trainer = make_trainer(cfg, folder, training_figures)
     except USER_ERRORS as error:
         console.print(f"[red]{type(error).__name__}:[/red] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(2)

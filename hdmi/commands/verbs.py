@@ -14,6 +14,7 @@ VERBS = {
     "plot": "learning curves of runs side by side",
     "export": "writes a policy alone, with evaluation, video and a card",
     "deploy": "runs an exported policy on a robot, real or simulated",
+    "simulate-robot": "a simulated robot that talks as the real one does, for deploy robot=unitree",
     "foreign": "brings in networks of others: describes one, checks it",
     "tasks": "lists the tasks, checks them, or renders a picture of each",
     "retarget": "from a person's motion to the robot's",
@@ -30,7 +31,7 @@ _HYDRA = ("train", "benchmark")  # read sys.argv themselves
 
 def usage() -> str:
     """The verbs and what each is for."""
-    lines = [f"    hdmi {verb:<10}  {what}" for verb, what in VERBS.items()]
+    lines = [f"    hdmi {verb:<14}  {what}" for verb, what in VERBS.items()]
     return "\n".join(["hdmi VERB [arguments]; hdmi VERB --help says more.", "", *lines])
 
 

@@ -45,7 +45,7 @@ class Options:
 
 def as_task(playback: Playback) -> Task:
     """What videos are made of."""
-    return Task(playback.motion.name, playback.scene, playback.reference)
+    return Task(playback.reference.name, playback.scene, playback.reference)
 
 
 def view(arguments: list[str], console: Console) -> int:
@@ -58,7 +58,7 @@ def view(arguments: list[str], console: Console) -> int:
     last = playback.num_frames - 1
     if not 0 <= options.start < last:
         raise ConfigError(f"start: expected a frame from 0 to {last - 1}, got {options.start}")
-    name = playback.motion.name
+    name = playback.reference.name
     console.print(f"{name}: {last + 1} frames at {playback.fps:g} fps, {taken}", highlight=False, soft_wrap=True)
     ghost = None if options.ghost is None else load_view(options.ghost, options.task, options.config_dir)[0]
     if options.viewer:

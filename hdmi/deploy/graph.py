@@ -28,9 +28,9 @@ def name_of(key: NestedKey) -> str:
     return key if isinstance(key, str) else ".".join(key)
 
 
-def forward_part(stack: list[tuple[str, Transform]], goal: NestedKey = "policy") -> list[tuple[str, Transform]]:
-    """The transforms that an entry depends on, in their order, without those that only training needs."""
-    needed, part = {unravel_key(goal)}, []
+def forward_part(stack: list[tuple[str, Transform]], *goals: NestedKey) -> list[tuple[str, Transform]]:
+    """The transforms that some entries depend on, in their order, without those that only training needs."""
+    needed, part = {unravel_key(goal) for goal in goals}, []
     for name, transform in reversed(stack):
         if getattr(transform, "training_only", False):
             continue
@@ -154,7 +154,8 @@ class PolicyGraph(nn.Module):
         super().__init__()
         self.measured, self.network, self.action_key = measured, network_of(actor), action_key
         self.others = measured.unmeasured()
-        forward, inverse = forward_part(stack), inverse_part(stack, action_key)
+        inverse = inverse_part(stack, action_key)
+        forward = forward_part(stack, "policy", *(key for _, t in inverse for key in getattr(t, "state_keys", ())))
         used = {unravel_key(key) for _, t in forward for key in t.in_keys or ()}
         used |= {unravel_key(key) for _, t in inverse for key in getattr(t, "state_keys", ())}
         self.stages = [(n, t.restricted(used) if isinstance(t, MotionReference) else t) for n, t in forward]

@@ -91,6 +91,10 @@ class Robot(Protocol):
         """Damping without stiffness from now on, until the next command. May be called at any time, repeatedly."""
         ...
 
+    def remarks(self) -> tuple[str, ...]:
+        """What the operator should know of the wire when a run is over, a line each, such as lost messages."""
+        ...
+
     def close(self) -> None:
         """Damps and lets go of the robot. May be called repeatedly."""
         ...

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 
@@ -92,3 +94,13 @@ def yaw_of(quat: np.ndarray) -> np.ndarray:
     half = 0.5 * np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     zero = np.zeros_like(half)
     return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
+
+
+def turn_about(axis: np.ndarray, quat: np.ndarray) -> float:
+    """The angle of a rotation's part about a unit axis, rad, in (-pi, pi]. [3], [4]"""
+    return wrapped(2.0 * math.atan2(float(quat[1:] @ axis), float(quat[0])))
+
+
+def wrapped(angle: float) -> float:
+    """The same angle in (-pi, pi], rad."""
+    return math.pi - (math.pi - angle) % (2.0 * math.pi)

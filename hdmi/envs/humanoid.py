@@ -31,7 +31,8 @@ class HumanoidObjectEnv(EnvBase):
     Action:
         `action`: joint position targets, rad. [N, J], held for the control step; or [N, S, J], one after
         another for decimation / S physics steps each. Optionally `push` [N, 6]: linear (m/s) and angular (rad/s)
-        world velocity to add to the root first.
+        world velocity to add to the root first; `wrench/root` and `wrench/object` [N, 6]: force (N) and moment
+        (N m) about the body's origin, world frame, during the step.
 
     Writes (float32, world frame, quaternions wxyz; J joints, B bodies, F feet, K object joints, E effectors):
         `robot/{joint_pos, joint_vel, joint_torque, joint_target}` [N, J];
@@ -179,6 +180,9 @@ class HumanoidObjectEnv(EnvBase):
         push = tensordict.get("push", None)
         if push is not None:
             self._push(push)
+        wrenches = tensordict.get("wrench", None)
+        if wrenches is not None:
+            self._pull(wrenches)
         self.backend.step(targets.repeat_interleave(decimation // count, dim=1))
         failed = self.backend.failed()
         out = self._survivors(failed)
@@ -208,6 +212,17 @@ class HumanoidObjectEnv(EnvBase):
         qvel[:, :3] += velocity[:, :3]
         qvel[:, 3:6] += quat_apply_inverse(quat, velocity[:, 3:])
         self.backend.refresh((velocity != 0).any(-1))
+
+    def _pull(self, wrenches: TensorDictBase) -> None:
+        """Applies forces and moments about the origins of the root and the object during the step. [N, 6] each"""
+        applied = self.backend.data("xfrc_applied")
+        bodies = {"root": int(self.scene.body_ids[0]), "object": self.scene.object_body}
+        for name, wrench in wrenches.items():
+            body = bodies[name]
+            force, moment = wrench.to(applied.dtype).split(3, dim=-1)
+            # MuJoCo's act on the centre of mass
+            lever = self.backend.data("xpos")[:, body] - self.backend.data("xipos")[:, body]
+            applied[:, body] = torch.cat([force, moment + torch.linalg.cross(lever, force)], dim=-1)
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)

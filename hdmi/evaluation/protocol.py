@@ -64,7 +64,7 @@ def unit_of(figure: str) -> str:
 def evaluation_config(
     cfg: DictConfig, terminations: Sequence[str] | None = None, start: int = 0, without: Sequence[str] = ()
 ) -> DictConfig:
-    """The training config changed to the protocol; reset noise, randomization and observation noise stay.
+    """The training config changed to the protocol; reset noise, randomization and observation noise stay, aids go.
 
     Args:
         terminations: names of the terminations that end episodes; None for those of the training.
@@ -81,7 +81,8 @@ def evaluation_config(
         cls = ReferenceStateInitialization
         kept = {key: value for key, value in node.items() if key in inspect.signature(cls).parameters}
         state = kept | {"start": start, "first_share": 0.0, "_target_": f"{cls.__module__}.{cls.__qualname__}"}
-        cfg.reset = {**(cfg.reset or {}), "state": state}
+        cfg.reset = {"state": state}
+        cfg.early_end, cfg.assist = {}, {}
         known = termination_names(cfg)
         if unknown := [name for name in terminations or () if name not in known]:
             raise ConfigError(f"terminations: the config has no {unknown}; there is {known}")

@@ -1,5 +1,6 @@
-"""Pure tensor functions: rotations, tracking errors, reward and termination kernels."""
+"""Pure tensor functions: rotations, servo targets, tracking errors, reward and termination kernels."""
 
+from hdmi.functional.control import feedforward_target, spring_wrench
 from hdmi.functional.pose import body_velocity, local_pose
 from hdmi.functional.reward import (
     action_rate,
@@ -23,6 +24,7 @@ from hdmi.functional.rotation import (
     quat_from_euler,
     quat_multiply,
     quat_to_rot6d,
+    quat_to_rotation_vector,
     yaw_quat,
 )
 from hdmi.functional.termination import any_error_exceeds, contact_lost, error_exceeds, persist
@@ -34,6 +36,7 @@ __all__ = [
     "body_velocity",
     "contact_lost",
     "error_exceeds",
+    "feedforward_target",
     "feet_air_time",
     "feet_impact",
     "feet_slip",
@@ -50,6 +53,8 @@ __all__ = [
     "quat_from_euler",
     "quat_multiply",
     "quat_to_rot6d",
+    "quat_to_rotation_vector",
+    "spring_wrench",
     "sum_of_squares",
     "tracking",
     "tracking_mean",

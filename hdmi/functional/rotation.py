@@ -132,3 +132,16 @@ def quat_to_rot6d(q: Tensor) -> Tensor:
         ],
         dim=-1,
     )
+
+
+def quat_to_rotation_vector(q: Tensor) -> Tensor:
+    """Axis times angle, at most pi, of unit quaternions wxyz. [..., 4] -> [..., 3], rad
+
+    Examples:
+        >>> quat_to_rotation_vector(torch.tensor([0.5**0.5, 0.0, 0.0, -(0.5**0.5)]))  # a quarter turn to the right
+        tensor([ 0.0000,  0.0000, -1.5708])
+    """
+    q = torch.where(q[..., :1] < 0, -q, q)  # the shorter way
+    sine = q[..., 1:].norm(dim=-1, keepdim=True)  # of half the angle
+    angle = 2 * torch.atan2(sine, q[..., :1])
+    return q[..., 1:] * torch.where(sine > 1e-6, angle / sine.clamp(min=1e-6), 2.0)

@@ -3,11 +3,13 @@
 from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from hdmi.learning.networks import RunningNorm, make_actor, make_critic
 from hdmi.learning.policy import export_policy, load_config, load_policy
-from hdmi.learning.trainer import Trainer
+from hdmi.learning.teacher import TeacherStudentTrainer
+from hdmi.learning.trainer import Trainer, make_trainer
 
 __all__ = [
     "CheckpointError",
     "RunningNorm",
+    "TeacherStudentTrainer",
     "Trainer",
     "export_policy",
     "load_checkpoint",
@@ -15,5 +17,6 @@ __all__ = [
     "load_policy",
     "make_actor",
     "make_critic",
+    "make_trainer",
     "save_checkpoint",
 ]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
@@ -117,15 +118,22 @@ class _GaussianHead(_Network):
 
 
 def make_actor(
-    in_size: int, out_size: int, hidden: Sequence[int], activation: str, init_noise: float, bf16: bool
+    in_size: int,
+    out_size: int,
+    hidden: Sequence[int],
+    activation: str,
+    init_noise: float,
+    bf16: bool,
+    in_key: NestedKey = "policy",
 ) -> ProbabilisticActor:
-    """Gaussian policy: `policy` [..., in_size] -> `action` [..., out_size] with `loc`, `scale`, `action_log_prob`."""
-    return _actor(_GaussianHead(in_size, out_size, init_noise, hidden=hidden, activation=activation, bf16=bf16))
+    """Gaussian policy: `in_key` [..., in_size] -> `action` [..., out_size] with `loc`, `scale`, `action_log_prob`."""
+    head = _GaussianHead(in_size, out_size, init_noise, hidden=hidden, activation=activation, bf16=bf16)
+    return _actor(head, in_key)
 
 
-def _actor(head: nn.Module) -> ProbabilisticActor:
+def _actor(head: nn.Module, in_key: NestedKey) -> ProbabilisticActor:
     return ProbabilisticActor(
-        TensorDictModule(head, in_keys=["policy"], out_keys=["loc", "scale"]),
+        TensorDictModule(head, in_keys=[in_key], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         return_log_prob=True,
@@ -152,7 +160,7 @@ class _AfterNorm(nn.Module):
         return self.network.forward_normalised(normalised)
 
 
-def network_of(module: nn.Module) -> _Network:
+def network_of(module: nn.Module) -> Any:
     """The network of an actor or critic."""
     return next(m for m in module.modules() if isinstance(m, _Network))
 
@@ -168,13 +176,14 @@ def bound_noise(actor: nn.Module) -> None:
             head.log_std.copy_(head.bounded())
 
 
-def normalised_networks(actor: nn.Module, critic: nn.Module) -> tuple[ProbabilisticActor, ValueOperator]:
-    """The same actor and critic, sharing parameters, for observations that are normalised already.
+def normalised_actor(actor: ProbabilisticActor) -> ProbabilisticActor:
+    """The same actor, sharing parameters, for observations that `network_of(actor).normalise` has normalised."""
+    return _actor(_AfterNorm(network_of(actor)), actor.in_keys[0])
 
-    Their `policy` [..., in_size] and `critic` [..., in_size] are what `network_of(...).normalise` returns; what they
-    write is what `make_actor` and `make_critic` say.
-    """
-    return _actor(_AfterNorm(network_of(actor))), _critic(_AfterNorm(network_of(critic)))
+
+def normalised_critic(critic: ValueOperator) -> ValueOperator:
+    """As `normalised_actor`, of a critic."""
+    return _critic(_AfterNorm(network_of(critic)))
 
 
 def use_bf16(setting: str | bool, device: torch.device) -> bool:

@@ -18,10 +18,18 @@ def make_networks(
 ) -> tuple[ProbabilisticActor, ValueOperator]:
     """Actor and critic of a config. sizes: of `policy`, `critic` and `action`."""
     algo = cfg.algo
+    actor = make_actor_of(cfg, sizes["policy"], sizes["action"], device)
+    critic = make_critic(sizes["critic"], algo.critic_hidden, algo.activation, use_bf16(algo.bf16, device))
+    return actor, critic.to(device)
+
+
+def make_actor_of(
+    cfg: DictConfig, in_size: int, out_size: int, device: torch.device, in_key: str = "policy"
+) -> ProbabilisticActor:
+    """An actor of a config from an observation [..., in_size]."""
+    algo = cfg.algo
     bf16 = use_bf16(algo.bf16, device)
-    actor = make_actor(sizes["policy"], sizes["action"], algo.actor_hidden, algo.activation, algo.init_noise, bf16)
-    critic = make_critic(sizes["critic"], algo.critic_hidden, algo.activation, bf16)
-    return actor.to(device), critic.to(device)
+    return make_actor(in_size, out_size, algo.actor_hidden, algo.activation, algo.init_noise, bf16, in_key).to(device)
 
 
 def load_config(path: str | Path) -> DictConfig:

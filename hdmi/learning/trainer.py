@@ -17,11 +17,13 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel
 from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.utils import KLAdaptiveLR
 from torchrl.objectives.value import GAE
@@ -32,7 +34,7 @@ from hdmi.console import make_console
 from hdmi.learning.checkpoint import CheckpointError, claim, load_checkpoint, rotate, save_checkpoint, supersede
 from hdmi.learning.distributed import Ranks
 from hdmi.learning.logger import RunLogger
-from hdmi.learning.networks import bound_noise, network_of, normalised_networks
+from hdmi.learning.networks import bound_noise, network_of, normalised_actor, normalised_critic
 from hdmi.learning.policy import make_networks
 from hdmi.learning.resume import CONFIG_FILE, problem_changes
 from hdmi.motion import find_motion
@@ -40,6 +42,13 @@ from hdmi.threads import set_threads
 
 _WARMUP_STEPS = 8  # of the untrained policy, for first observation moments
 _MAX_BAD_UPDATES = 20  # minibatches without finite loss or gradient, in a row
+_FIGURES = {  # name in the log -> of the losses
+    "loss_actor": "loss_objective",
+    "loss_critic": "loss_critic",
+    "entropy": "entropy",
+    "clip_fraction": "clip_fraction",
+    "imitation": "imitation",
+}
 _COLLECTED_KEYS = ("action", "action_log_prob", ("next", "reward"), ("next", "done"), ("next", "terminated"))
 
 
@@ -67,8 +76,9 @@ class Trainer:
             the task; without it there are none during training.
 
     Attributes:
-        actor: that acts in training.
-        averaged: `averaged.module` is the policy that leaves it.
+        policy: from deployable observations.
+        actor: that acts in training: the policy.
+        averaged: `averaged.module` is the policy that leaves the training.
 
     Raises:
         CheckpointError: for a checkpoint that cannot be continued under this config; see `restore`.
@@ -113,21 +123,14 @@ class Trainer:
             "critic": spec["critic"].shape[-1],
             "action": self.env.action_spec.shape[-1],
         }
-        self.actor, self.critic = make_networks(cfg, self.sizes, self.device)
+        self.policy, self.critic = make_networks(cfg, self.sizes, self.device)
+        self.actor = self._acting()
         # moments do not change within an update: the learner normalises observations once for all epochs
-        actor, self.normalised_critic = normalised_networks(self.actor, self.critic)
+        self.normalised_critic = normalised_critic(self.critic)
         algo = cfg.algo
-        self.averaged = AveragedModel(self.actor, avg_fn=partial(_recent_mean, share=algo.average))
-        self.loss = ClipPPOLoss(
-            actor,
-            self.normalised_critic,
-            clip_epsilon=algo.clip,
-            entropy_coeff=algo.entropy,
-            critic_coeff=1.0,
-            loss_critic_type="smooth_l1",
-            normalize_advantage=False,
-        )
-        self.objective = _Objective(self.loss) if self.ranks.size == 1 else _parallel(_Objective(self.loss))
+        self.averaged = AveragedModel(self.policy, avg_fn=partial(_recent_mean, share=algo.average))
+        objective = self._objective()
+        self.objective = objective if self.ranks.size == 1 else _parallel(objective)
         self.gae = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=None)
         self.actor_optim = torch.optim.Adam(self.actor.parameters(), lr=algo.actor_lr, fused=True)
         self.critic_optim = torch.optim.Adam(self.critic.parameters(), lr=algo.critic_lr, fused=True)
@@ -153,10 +156,38 @@ class Trainer:
             )
             self._update_moments(batch)
             # The learner once, for nothing: compiled code is guarded by tables of tensordict that its first use fills.
-            self.loss(self.prepare(batch))
+            self.objective(self.prepare(batch))
+
+    def _acting(self) -> TensorDictModuleBase:
+        """What acts in training, and is trained: the policy."""
+        return self.policy
+
+    def _objective(self) -> torch.nn.Module:
+        """What gives the loss of a minibatch, and its parts."""
+        return Objective(self._loss(self.policy))
+
+    def _loss(self, actor: ProbabilisticActor) -> ClipPPOLoss:
+        algo = self.cfg.algo
+        return ClipPPOLoss(
+            normalised_actor(actor),
+            self.normalised_critic,
+            clip_epsilon=algo.clip,
+            entropy_coeff=algo.entropy,
+            critic_coeff=1.0,
+            loss_critic_type="smooth_l1",
+            normalize_advantage=False,
+        )
+
+    def _actors(self) -> list[torch.nn.Module]:
+        """The networks of `actor`, whose gradients are bounded each by itself."""
+        return [self.policy]
+
+    def _networks(self) -> list[tuple[NestedKey, torch.nn.Module]]:
+        """Networks that keep moments of an observation, with its key."""
+        return [("policy", self.policy), ("critic", self.critic)]
 
     def _update_moments(self, batch: TensorDictBase) -> None:
-        for key, network in (("policy", self.actor), ("critic", self.critic)):
+        for key, network in self._networks():
             values = batch[key].reshape(-1, batch[key].shape[-1])
             network_of(network).norm.update(*self.ranks.moments(values), n=len(values) * self.ranks.size)
 
@@ -173,7 +204,7 @@ class Trainer:
             `advantage`, `value_target` [N T, 1].
         """
         data = batch.select(*_COLLECTED_KEYS)
-        for key, network in (("policy", self.actor), ("critic", self.critic)):
+        for key, network in (("policy", self.policy), ("critic", self.critic)):
             data.set(key, network_of(network).normalise(batch[key]))
         value = self.normalised_critic(data)["state_value"]  # [N, T, 1]
         # The next state is the next step's, but where an episode or the batch ends.
@@ -208,7 +239,7 @@ class Trainer:
                 for key, value in losses.items():
                     sums[key] = sums.get(key, 0.0) + value
         self._update_moments(batch)
-        self.averaged.update_parameters(self.actor)
+        self.averaged.update_parameters(self.policy)
         stats = {key: value / max(count, 1) for key, value in sums.items()}
         target, error = data["value_target"], data["value_target"] - data["state_value"]
         stats["explained_variance"] = float(1 - error.var() / (target.var() + 1e-8))
@@ -224,16 +255,11 @@ class Trainer:
         total.backward()
         total, kl = self.ranks.mean(torch.stack([total.detach(), losses["kl_approx"]]))
         norm = self.cfg.algo.max_grad_norm
-        actor_norm = torch.nn.utils.clip_grad_norm_(self.actor.parameters(), norm)
+        norms = [torch.nn.utils.clip_grad_norm_(actor.parameters(), norm) for actor in self._actors()]
+        actor_norm = torch.stack(norms).sum()
         critic_norm = torch.nn.utils.clip_grad_norm_(self.critic.parameters(), norm)
-        figures = {
-            "loss_actor": losses["loss_objective"],
-            "loss_critic": losses["loss_critic"],
-            "entropy": losses["entropy"],
-            "clip_fraction": losses["clip_fraction"],
-            "kl": kl,
-            "grad_norm_actor": actor_norm,
-        }
+        figures = {name: losses[key] for name, key in _FIGURES.items() if key in losses}
+        figures |= {"kl": kl, "grad_norm_actor": actor_norm}
         # the device is waited for once, not for each figure
         finite = torch.stack([total, actor_norm, critic_norm]).isfinite().all()
         *values, usable = torch.stack([*(v.detach() for v in figures.values()), finite.to(total.dtype)]).tolist()
@@ -443,6 +469,17 @@ class Trainer:
         torch.set_rng_state(own["rng"].cpu())
 
 
+def make_trainer(cfg: DictConfig, folder: Path, evaluate: Evaluate | None = None) -> Trainer:
+    """The trainer that a config's `algo.trainer` names; `Trainer` without one. Arguments are those of `Trainer`.
+
+    Raises:
+        ConfigError: if there is none of that name.
+    """
+    node = {"_target_": cfg.algo.get("trainer") or "hdmi.learning.Trainer"}
+    trainer: Trainer = build(node, "algo.trainer", cfg=cfg, folder=folder, evaluate=evaluate)
+    return trainer
+
+
 @contextmanager
 def _deferred_interrupt(wanted: bool) -> Iterator[Callable[[], bool]]:
     """Notes a first Ctrl-C, for the caller to ask for, and passes on a second one.
@@ -470,7 +507,7 @@ def _deferred_interrupt(wanted: bool) -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-class _Objective(torch.nn.Module):
+class Objective(torch.nn.Module):
     """The loss to descend and its parts, as one module."""
 
     def __init__(self, loss: ClipPPOLoss):
@@ -482,7 +519,7 @@ class _Objective(torch.nn.Module):
         return losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"], losses
 
 
-def _parallel(objective: _Objective) -> DistributedDataParallel:
+def _parallel(objective: torch.nn.Module) -> DistributedDataParallel:
     # running moments are averaged where they are updated; gradients need not be copied to be reduced
     return DistributedDataParallel(objective, broadcast_buffers=False, gradient_as_bucket_view=True)
 

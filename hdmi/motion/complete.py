@@ -69,10 +69,14 @@ def complete_robot(motion: Motion, robot: RobotConfig | None = None) -> Motion:
     held = robot.held_joints
     joint_pos = np.tile(robot.default_joint_pos, (num_frames, 1))
     joint_vel = np.zeros_like(joint_pos)
+    target = motion.joint_target
+    joint_target = joint_pos.copy()
     for i, name in enumerate(motion.joint_names):
         if name in model.joint_names and name not in held:
             j = model.joint_names.index(name)
             joint_pos[:, j], joint_vel[:, j] = motion.joint_pos[:, i], motion.joint_vel[:, i]
+            if target is not None:
+                joint_target[:, j] = target[:, i]
 
     root = motion.body_names.index(model.root)
     pos, quat = forward_kinematics(model, motion.body_pos_w[:, root], motion.body_quat_w[:, root], joint_pos)
@@ -96,6 +100,7 @@ def complete_robot(motion: Motion, robot: RobotConfig | None = None) -> Motion:
         body_names=(*model.body_names, *(motion.body_names[i] for i in bodies)),
         joint_pos=joined(joint_pos, motion.joint_pos[:, joints]),
         joint_vel=joined(joint_vel, motion.joint_vel[:, joints]),
+        joint_target=None if target is None else joined(joint_target, target[:, joints]),
         body_pos_w=joined(pos, motion.body_pos_w[:, bodies]),
         body_quat_w=joined(quat, motion.body_quat_w[:, bodies]),
         body_lin_vel_w=joined(lin_vel, motion.body_lin_vel_w[:, bodies]),
@@ -119,15 +124,15 @@ def resample(motion: Motion, fps: float) -> Motion:
             "needs at least 2"
         )
     nearest = nearest_frames(old, new)
+    optional = [key for key in ("contact_points", "joint_target") if getattr(motion, key) is not None]
     sampled: dict[str, Any] = {
         key: interpolate(getattr(motion, key), old, new)
-        for key in ("body_pos_w", "body_lin_vel_w", "body_ang_vel_w", "joint_pos", "joint_vel")
+        for key in ("body_pos_w", "body_lin_vel_w", "body_ang_vel_w", "joint_pos", "joint_vel", *optional)
     }
     return replace(
         motion,
         fps=fps,
         body_quat_w=interpolate_quat(motion.body_quat_w, old, new),
         object_contact=None if motion.object_contact is None else motion.object_contact[nearest],
-        contact_points=None if motion.contact_points is None else interpolate(motion.contact_points, old, new),
         **sampled,
     )

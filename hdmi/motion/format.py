@@ -13,6 +13,7 @@ motion.npz, float32, world frame, quaternions wxyz:
 | joint_vel          | [T, J]    | rad/s; re-derived when absent                                |
 | object_contact     | [T, E]    | intended contact, bool or 0/1; one column serves all effectors |
 | contact_points     | [T, E, 3] | in the frame of the object's link, m; the task's when absent |
+| joint_target       | [T, J]    | rad; where servos are to be sent, optional                   |
 
 Nothing says whether `body_lin_vel_w` is of the bodies' origins or of their centres of mass, as in the public motions
 and whatever else Isaac wrote: files keep what they have, `make_reference` takes differences of positions.
@@ -58,6 +59,7 @@ class Motion:
     joint_vel: np.ndarray
     object_contact: np.ndarray | None = None  # bool [T, E]
     contact_points: np.ndarray | None = None  # [T, E, 3]
+    joint_target: np.ndarray | None = None  # [T, J]
 
     @property
     def num_frames(self) -> int:
@@ -72,6 +74,7 @@ class Motion:
             joint_names=tuple(self.joint_names[j] for j in kept),
             joint_pos=self.joint_pos[:, kept],
             joint_vel=self.joint_vel[:, kept],
+            joint_target=None if self.joint_target is None else self.joint_target[:, kept],
         )
 
 
@@ -108,7 +111,7 @@ def motion_from_poses(
 
 _REQUIRED = {"body_pos_w": 3, "body_quat_w": 4, "joint_pos": None}
 _OPTIONAL = {"body_lin_vel_w": 3, "body_ang_vel_w": 3, "joint_vel": None}
-_LABELS = ("object_contact", "contact_points")
+_EXTRAS = ("object_contact", "contact_points", "joint_target")
 _BECAUSE = " from meta.json and joint_pos"
 
 
@@ -133,7 +136,7 @@ def load_motion(path: str | Path) -> Motion:
     checked_fps(meta_path, fps)
     body_names = checked_names(meta_path, "body_names", body_names)
     joint_names = checked_names(meta_path, "joint_names", joint_names)
-    arrays = read_npz(npz_path, {*_REQUIRED, *_OPTIONAL, *_LABELS})
+    arrays = read_npz(npz_path, {*_REQUIRED, *_OPTIONAL, *_EXTRAS})
     for key in _REQUIRED:
         if key not in arrays:
             raise MotionError(f"{npz_path}: lacks {key!r}; it has {sorted(arrays)}")
@@ -158,6 +161,9 @@ def load_motion(path: str | Path) -> Motion:
     if "contact_points" in arrays:
         raw = arrays["contact_points"]
         points = checked(npz_path, "contact_points", raw, (num_frames, *raw.shape[1:2], 3))
+    target = arrays.get("joint_target")
+    if target is not None:
+        target = checked(npz_path, "joint_target", target, (num_frames, len(joint_names)), _BECAUSE)
     return Motion(
         name=folder.name,
         fps=fps,
@@ -165,6 +171,7 @@ def load_motion(path: str | Path) -> Motion:
         joint_names=joint_names,
         object_contact=contact,
         contact_points=points,
+        joint_target=target,
         **values,
     )
 
@@ -176,8 +183,9 @@ def save_motion(motion: Motion, path: str | Path) -> Path:
     arrays = {key: value.astype(np.float32) for key, value in arrays.items()}
     if motion.object_contact is not None:
         arrays["object_contact"] = motion.object_contact
-    if motion.contact_points is not None:
-        arrays["contact_points"] = motion.contact_points.astype(np.float32)
+    for key in ("contact_points", "joint_target"):
+        if (values := getattr(motion, key)) is not None:
+            arrays[key] = values.astype(np.float32)
     write_npz(folder / "motion.npz", arrays)
     meta = {"body_names": list(motion.body_names), "joint_names": list(motion.joint_names), "fps": motion.fps}
     write_text(folder / "meta.json", json.dumps(meta, indent=1) + "\n")

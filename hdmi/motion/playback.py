@@ -17,6 +17,7 @@ from hdmi.motion.kinematics import smoothing_window
 from hdmi.motion.reference import Reference, make_reference
 
 FAR = 0.5  # m; distances between geoms are not looked for beyond it
+TOUCH = 0.02  # m; surfaces this near each other can push
 
 
 def reference_qpos(scene: Scene, reference: Reference, frames: int | slice = slice(None)) -> np.ndarray:
@@ -48,15 +49,10 @@ class Playback:
         ((550, 3), (550, 3, 3))
     """
 
-    motion: Motion
     reference: Reference
     scene: Scene
     qpos: np.ndarray  # [T, nq]
-
-    @property
-    def fps(self) -> float:
-        """Frames per second."""
-        return self.motion.fps
+    fps: float
 
     @property
     def num_frames(self) -> int:
@@ -132,6 +128,30 @@ class Playback:
         """Distances of the object's geoms from the ground, see `distances`. [T, O]"""
         return self.distances(self.scene.object_geoms, self.ground_geoms)
 
+    @cached_property
+    def clearance(self) -> np.ndarray:
+        """Distances of the robot's geoms from what it may stand on, m. [T, R]
+
+        That is the ground, and an object that stands itself; but not on its arms there: those hold it.
+        """
+        scene = self.scene
+        if not scene.object_geoms.size:
+            return self.ground_distance
+        names = [self.geom_name(g) for g in self.robot_geoms]
+        on_arms = np.array([any(word in name for word in ("shoulder", "elbow", "wrist", "hand")) for name in names])
+        stands = (self.object_clearance.min(axis=1) < TOUCH) | (scene.object_free_dof is None)
+        return np.minimum(self.ground_distance, np.where(stands[:, None] & ~on_arms, self.object_distance, np.inf))
+
+    @property
+    def ground_gap(self) -> float:
+        """Height of the robot's lowest point over what it may stand on in the median frame, m; 0 on or in it."""
+        return max(float(np.median(self.clearance.min(axis=1))), 0.0)
+
+    def geom_name(self, geom: int) -> str:
+        """Name of a geom, or of its body if it has none."""
+        model = self.scene.model
+        return model.geom(geom).name or model.body(model.geom_bodyid[geom]).name
+
     def distances(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """Signed distances between geoms (meshes as their convex hulls), negative inside, at most `FAR`, m.
 
@@ -198,4 +218,4 @@ def make_playback(
                 f"motion {motion.name!r}: body_names lacks {item.name!r}, scenery without a pos in the task"
             )
     scene = build_scene(robot, SimConfig(), object, scenery, effectors, reference.placements)
-    return Playback(motion, reference, scene, reference_qpos(scene, reference))
+    return Playback(reference, scene, reference_qpos(scene, reference), motion.fps)

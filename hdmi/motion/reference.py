@@ -50,6 +50,7 @@ class Reference:
     contact: Tensor  # bool [T, E]
     contact_point: Tensor  # [T, E, 3] in the frame of the object's link
     placements: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]  # object and scenery at the first frame
+    joint_target: Tensor | None = None  # [T, J] rad, where servos are to be sent, if the motion says so
 
     @property
     def num_frames(self) -> int:
@@ -165,6 +166,7 @@ def make_reference(
         contact=torch.from_numpy(contact.copy()),
         contact_point=tensor(points),
         placements=placements,
+        joint_target=None if motion.joint_target is None else tensor(motion.joint_target[:, :num_joints]),
     )
 
 

@@ -22,7 +22,7 @@ from hdmi.assembly import Task, make_env, make_task, scene_parts
 from hdmi.config import ConfigError, task_config
 from hdmi.evaluation.agents import blind_agent
 from hdmi.evaluation.protocol import EvalResult, evaluate_policy
-from hdmi.learning import Trainer
+from hdmi.learning import make_trainer
 from hdmi.motion import find_motion, load_motion, make_playback
 from hdmi.threads import set_threads
 
@@ -198,7 +198,7 @@ def check_task(
 def _train(cfg: DictConfig, task: Task) -> Training:
     """What a training changes; it leaves nothing behind."""
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()):
-        trainer = Trainer(cfg, Path(folder))
+        trainer = make_trainer(cfg, Path(folder))
         before = returns(cfg, task, trainer.actor)
         trainer.run()
         return Training(before, returns(cfg, task, trainer.actor))

@@ -22,7 +22,9 @@ from hdmi.transforms.action import (
     JointPositionAction,
     ResidualAction,
 )
+from hdmi.transforms.assist import SpringAssist
 from hdmi.transforms.concatenate import Concatenate
+from hdmi.transforms.feedforward import FeedForwardTarget
 from hdmi.transforms.observation import (
     Difference,
     EpisodeNoise,
@@ -50,6 +52,7 @@ from hdmi.transforms.reference import (
     MotionEnd,
     MotionReference,
     ReferenceStateInitialization,
+    Rewind,
 )
 from hdmi.transforms.reward import (
     ActionRateL2,
@@ -106,6 +109,7 @@ __all__ = [
     "Distance",
     "EpisodeNoise",
     "ErrorTermination",
+    "FeedForwardTarget",
     "FeetAirTime",
     "FeetImpactL2",
     "FeetSlip",
@@ -140,6 +144,8 @@ __all__ = [
     "ResidualAction",
     "RewardRate",
     "RewardTerm",
+    "Rewind",
+    "SpringAssist",
     "SurvivalReward",
     "TerminationTerm",
     "TrackedBodies",

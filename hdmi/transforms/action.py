@@ -15,7 +15,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from hdmi.names import match_names
-from hdmi.transforms.common import SpecTransform, StateTransform, add_state_specs, below, key_of
+from hdmi.transforms.common import SpecTransform, StateTransform, add_read_state, below, key_of
 
 
 def width_of_action(transform: Transform, action_key: NestedKey) -> int:
@@ -48,18 +48,7 @@ class _ActionTransform(SpecTransform):
         return tensordict
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
-        input_spec = super().transform_input_spec(input_spec)
-        declared = input_spec["full_state_spec"]
-        missing = [
-            key for key in self.state_keys if declared is None or unravel_key(key) not in declared.keys(True, True)
-        ]
-        if missing and self.parent is not None:
-            have = self.parent.full_observation_spec
-            for key in missing:
-                if unravel_key(key) not in have.keys(True, True):
-                    raise KeyError(f"{type(self).__name__}: reads {key!r}, which nothing before it writes")
-            add_state_specs(input_spec, {key: have[unravel_key(key)].clone() for key in missing})
-        return input_spec
+        return add_read_state(super().transform_input_spec(input_spec), self, self.state_keys)
 
 
 class JointPositionAction(_ActionTransform):

@@ -185,6 +185,23 @@ def add_state(observation_spec: Composite, key: NestedKey, value: Tensor, owner:
     observation_spec[unravel_key(key)] = spec_like(value)
 
 
+def add_read_state(input_spec: Composite, owner: Transform, keys: Sequence[NestedKey]) -> Composite:
+    """Declares what a transform reads of the present step besides the action, in place; specs are those of the writers.
+
+    Raises:
+        KeyError: for a key that nothing before the transform writes.
+    """
+    declared = input_spec["full_state_spec"]
+    missing = [key for key in keys if declared is None or unravel_key(key) not in declared.keys(True, True)]
+    if not missing or owner.parent is None:
+        return input_spec
+    have = owner.parent.full_observation_spec
+    for key in missing:
+        if unravel_key(key) not in have.keys(True, True):
+            raise KeyError(f"{type(owner).__name__}: reads {key!r}, which nothing before it writes")
+    return add_state_specs(input_spec, {key: have[unravel_key(key)].clone() for key in missing})
+
+
 def add_state_specs(input_spec: Composite, specs: Mapping[NestedKey, TensorSpec]) -> Composite:
     """Declares keys that a step reads from the tensordict besides the action, in place."""
     if input_spec["full_state_spec"] is None:

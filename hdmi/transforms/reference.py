@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from hdmi.functional import local_pose, quat_from_euler, quat_multiply
-from hdmi.names import FRAME_KEY, NOISE_SHARE_KEY, match_names
+from hdmi.names import FRAME_KEY, NOISE_SHARE_KEY, REWIND_KEY, match_names
 from hdmi.transforms.common import (
     SpecTransform,
     StateTransform,
@@ -181,7 +181,8 @@ class ReferenceStateInitialization(SpecTransform):
     joints are within their soft limits.
 
     Reads on reset, all optional: `init/object_scale` [N, 1], which transforms farther out draw; `init/frame` int64
-    [N, 1], where to start instead of at a drawn frame; `init/noise_share` [N, 1], factor of all perturbations.
+    [N, 1], where to start instead of at a drawn frame; `init/rewind_frame` int64 [N, 1], likewise, where it is not
+    negative; `init/noise_share` [N, 1], factor of all perturbations.
     Writes, before the base environment resets: `init/frame` and the state under `init_key` that `HumanoidObjectEnv`
     reads. It has no effect between resets.
 
@@ -225,6 +226,7 @@ class ReferenceStateInitialization(SpecTransform):
         scale_key: NestedKey = ("init", "object_scale"),
         frame_key: NestedKey = FRAME_KEY,
         noise_share_key: NestedKey = NOISE_SHARE_KEY,
+        rewind_key: NestedKey = REWIND_KEY,
     ):
         super().__init__()
         start = 0 if start == "first" else start
@@ -238,6 +240,7 @@ class ReferenceStateInitialization(SpecTransform):
         self.start, self.first_share = start, first_share
         self.init_key, self.scale_key = key_of(init_key), key_of(scale_key)
         self.frame_key, self.noise_share_key = key_of(frame_key), key_of(noise_share_key)
+        self.rewind_key = key_of(rewind_key)
         self.num_starts = max(reference.num_frames - margin, 1)
         self.reference = reference
         held = reference.contact.any(-1, keepdim=True)  # [T, 1]
@@ -269,6 +272,8 @@ class ReferenceStateInitialization(SpecTransform):
         frames = tensordict.get(self.frame_key, None)
         if frames is None:
             frames = self._start_frames(tensordict.batch_size, tensordict.device).unsqueeze(-1)
+            rewound = tensordict.get(self.rewind_key, None)
+            frames = frames if rewound is None else torch.where(rewound < 0, frames, rewound)
             tensordict.set(self.frame_key, frames)
         scale, noise_share = tensordict.get(self.scale_key, None), tensordict.get(self.noise_share_key, None)
         for key, value in self.initial_state(frames.squeeze(-1), scale, noise_share).items():
@@ -330,6 +335,55 @@ class ReferenceStateInitialization(SpecTransform):
         return state
 
 
+class Rewind(SpecTransform):
+    """Starts an episode some steps before the frame at which the last one of its environment failed, now and then.
+
+    Reads on reset, where they are, `terminated_key` bool [N, 1] and `step_key` int64 [N, 1] of the episode that ended;
+    writes `out_key` int64 [N, 1], which `ReferenceStateInitialization` reads: -1 where it is to draw. It has no effect
+    between resets.
+
+    Args:
+        share: of failed episodes that are rewound.
+        steps: least and most to go back.
+
+    Examples:
+        >>> back = Rewind(share=1.0, steps=(25, 25))
+        >>> ended = TensorDict({"terminated": [[True], [False]], "ref": {"step": [[100], [549]]}}, [2])
+        >>> back._reset_env_preprocess(ended)["init", "rewind_frame"].flatten()
+        tensor([75, -1])
+    """
+
+    training_only = True
+
+    def __init__(
+        self,
+        share: float = 0.8,
+        steps: Sequence[int] = (25, 125),
+        terminated_key: NestedKey = "terminated",
+        step_key: NestedKey = ("ref", "step"),
+        out_key: NestedKey = REWIND_KEY,
+    ):
+        super().__init__()
+        self.low, self.high = (int(s) for s in steps)
+        if not 0 <= self.low <= self.high:
+            raise ValueError(f"rewind: steps: expected 0 <= least <= most, got {list(steps)}")
+        if not 0 <= share <= 1:
+            raise ValueError(f"rewind: share: expected 0 to 1, got {share}")
+        self.share = share
+        self.terminated_key, self.step_key = key_of(terminated_key), key_of(step_key)
+        self.out_key = key_of(out_key)
+
+    def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
+        if tensordict is None:
+            return None
+        failed, step = tensordict.get(self.terminated_key, None), tensordict.get(self.step_key, None)
+        if failed is None or step is None:  # of the first reset
+            return tensordict
+        chosen = failed & (torch.rand(failed.shape, device=failed.device) < self.share)
+        back = torch.randint(self.low, self.high + 1, step.shape, device=step.device)
+        return tensordict.set(self.out_key, torch.where(chosen, (step - back).clamp(min=0), -1))
+
+
 class AdaptiveStateInitialization(ReferenceStateInitialization):
     """Reference state initialization that starts more often shortly before frames where episodes fail.
 
@@ -372,10 +426,11 @@ class AdaptiveStateInitialization(ReferenceStateInitialization):
         scale_key: NestedKey = ("init", "object_scale"),
         frame_key: NestedKey = FRAME_KEY,
         noise_share_key: NestedKey = NOISE_SHARE_KEY,
+        rewind_key: NestedKey = REWIND_KEY,
     ):
         super().__init__(
             reference, joint_ranges, start, margin, noise, held_noise, first_share, soft_limit, starts,
-            init_key, scale_key, frame_key, noise_share_key,
+            init_key, scale_key, frame_key, noise_share_key, rewind_key,
         )  # fmt: skip
         self.terminated_key, self.step_key = key_of(terminated_key), key_of(step_key)
         self.uniform_share, self.decay, self.lead = uniform_share, decay, lead

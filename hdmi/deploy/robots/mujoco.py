@@ -18,21 +18,22 @@ import mujoco
 import numpy as np
 
 from hdmi.deploy.description import Description, PolicyError
-from hdmi.deploy.format import SCENE_FILE
+from hdmi.deploy.format import scene_of
+from hdmi.deploy.line import Line
 from hdmi.deploy.robot import Reading
 from hdmi.deploy.rotations import quat_from_euler, quat_from_rotation_vector, quat_multiply
+from hdmi.deploy.scene import object_joints
 
 MAX_VELOCITY = 1e3  # m/s or rad/s; beyond it the simulation counts as diverged
 
 
 @dataclass
-class Options:
+class Plant:
     """All disturbances are off; ranges are half ranges of uniform draws, once per episode or each reading."""
 
     seed: int = 0  # of the first episode; the others follow
     timestep: float = 0.002  # s
     integrator: str = "implicitfast"  # or euler
-    servo_dt: float = 0.004  # s between commands
     start_noise: float = 1.0  # factor of the start's perturbations in training; 0: exactly the first frame
     gantry: float = 0.0  # s for which the root is held where the motion starts
     joint_pos_noise: float = 0.0  # rad, each reading
@@ -44,13 +45,20 @@ class Options:
     mocap_rate: float = 0.0  # Hz; 0: a frame each reading
     mocap_latency: float = 0.0  # s
     mocap_dropout: float = 0.0  # share of frames that are lost
-    action_delay: float = 0.0  # s from a command to the servos
     friction_loss: float = 0.0  # N m of dry friction in each joint
     effort_scale: float = 1.0  # factor of the motors' limits
     mass_scale: float = 1.0  # factor of the robot's masses and inertias
     floor_friction: float = 1.0  # factor of the robot's sliding friction
-    realtime: bool = False  # whether the clock keeps to the wall's
     viewer: bool = False  # a window
+
+
+@dataclass
+class Options(Plant):
+    """The plant's, and how the runner is coupled to it."""
+
+    servo_dt: float = 0.004  # s between commands
+    action_delay: float = 0.0  # s from a command to the servos
+    realtime: bool = False  # whether the clock keeps to the wall's
 
 
 class MujocoRobot:
@@ -88,7 +96,7 @@ class MujocoRobot:
         if root_joint < 0 or model.jnt_type[root_joint] != mujoco.mjtJoint.mjJNT_FREE:
             raise PolicyError(f"{scene}: body {description.root!r} has no free joint")
         self._root_qpos, self._root_dof = int(model.jnt_qposadr[root_joint]), int(model.jnt_dofadr[root_joint])
-        self._find_object()
+        self.object_body, self._object_free, self._object_hinge = object_joints(self.model)
         self._set_options()
         self._viewer: Any = None
         self._episode = -1
@@ -99,23 +107,6 @@ class MujocoRobot:
         if missing := [name for name, i in zip(names, ids, strict=True) if i < 0]:
             raise PolicyError(f"{scene}: has no {kind.name.removeprefix('mjOBJ_').lower()} {', '.join(missing)}")
         return np.array(ids)
-
-    def _find_object(self) -> None:
-        """The object is what the exporter's sensor of penetrations is about; its link hangs from it on a hinge."""
-        model = self.model
-        self.object_body: int | None = None
-        self._object_free: int | None = None
-        self._object_hinge: int | None = None
-        sensor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, "object_penetration")
-        if sensor < 0:
-            return
-        self.object_body = body = int(model.sensor_objid[sensor])
-        for joint in range(model.njnt):
-            at = int(model.jnt_bodyid[joint])
-            if at == body and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
-                self._object_free = joint
-            elif model.body_parentid[at] == body and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
-                self._object_hinge = joint
 
     def _set_options(self) -> None:
         model, options, description = self.model, self.options, self.description
@@ -179,6 +170,7 @@ class MujocoRobot:
         if self._object_hinge is not None and "object_joint_pos" in start:
             at = model.jnt_qposadr[self._object_hinge]
             data.qpos[at] = start["object_joint_pos"][0] + noise("object_joint", 1)[0]
+        self.held_until = o.gantry
         self._held = data.qpos[q : q + 7].copy() if o.gantry > 0 else None
         if self._held is not None:
             data.qvel[:] = 0.0
@@ -188,7 +180,8 @@ class MujocoRobot:
         self._commands: deque[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = deque()
         self._mocap: dict[str, np.ndarray] = {}
         self._mocap_next = 0.0
-        self._captured: deque[tuple[float, dict[str, np.ndarray]]] = deque()
+        self._captured = Line[dict[str, np.ndarray]](o.mocap_latency, o.mocap_dropout, rng)
+        self._shown = 0.0
         self._wall = time.perf_counter()
         self.damp()
         mujoco.mj_forward(model, data)
@@ -218,6 +211,13 @@ class MujocoRobot:
             return np.zeros(0)
         return self.data.qpos[self.model.jnt_qposadr[self._object_hinge]].reshape(1).copy()
 
+    def poses(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """True poses of `root`, `object` and the `part` that its hinge moves, as far as there are any: m and wxyz."""
+        bodies = {"root": self.root, "object": self.object_body}
+        bodies["part"] = None if self._object_hinge is None else int(self.model.jnt_bodyid[self._object_hinge])
+        data = self.data
+        return {name: (data.xpos[i].copy(), data.xquat[i].copy()) for name, i in bodies.items() if i is not None}
+
     # -- the protocol -----------------------------------------------------------------------------------------
 
     def time(self) -> float:
@@ -228,7 +228,7 @@ class MujocoRobot:
         # half a step early, so that rounding cannot add one
         while self.data.time < until - 0.5 * timestep:
             while self._commands and self._commands[0][0] <= self.data.time + 0.5 * timestep:
-                self._apply(*self._commands.popleft()[1:])
+                self.servo(*self._commands.popleft()[1:])
             if self._held is not None:
                 self._hold()
             mujoco.mj_step(self.model, self.data)
@@ -242,25 +242,29 @@ class MujocoRobot:
 
     def _hold(self) -> None:
         q, v = self._root_qpos, self._root_dof
-        if self.data.time >= self.options.gantry:
+        if self.data.time >= self.held_until:
             self._held = None
             return
         self.data.qpos[q : q + 7] = self._held
         self.data.qvel[v : v + 6] = 0.0
 
-    def read(self) -> Reading:
-        data, o, rng, now = self.data, self.options, self._rng, float(self.data.time)
+    def onboard(self) -> dict[str, np.ndarray]:
+        """What encoders and IMU measure now, by name."""
+        data, o, rng = self.data, self.options, self._rng
         q, v = self._root_qpos, self._root_dof
 
         def noisy(values: np.ndarray, half: float) -> np.ndarray:
             return values + rng.uniform(-half, half, values.shape) if half else values.copy()
 
-        sensors = {
+        return {
             "joint_pos": noisy(data.qpos[self._qpos], o.joint_pos_noise),
             "joint_vel": noisy(data.qvel[self._dof], o.joint_vel_noise),
             "root_quat_w": quat_multiply(data.qpos[q + 3 : q + 7], self._askew),
             "root_ang_vel_b": noisy(data.qvel[v + 3 : v + 6] + self._gyro_bias, o.gyro_noise),
         }
+
+    def read(self) -> Reading:
+        now, sensors = self.time(), self.onboard()
         stamps = dict.fromkeys(sensors, now)
         self._capture(now)
         sensors |= self._mocap
@@ -272,10 +276,9 @@ class MujocoRobot:
         o = self.options
         if now >= self._mocap_next - 1e-9:
             self._mocap_next = now + 1.0 / o.mocap_rate if o.mocap_rate else now
-            if self._rng.uniform() >= o.mocap_dropout:
-                self._captured.append((now, self._frame()))
-        while self._captured and self._captured[0][0] + o.mocap_latency <= now + 1e-9:
-            self._mocap_stamp, self._mocap = self._captured.popleft()
+            self._captured.put(now, self._frame)
+        if arrived := self._captured.due(now):
+            self._mocap_stamp, self._mocap = arrived[-1]
 
     def _frame(self) -> dict[str, np.ndarray]:
         """What motion capture sees now."""
@@ -291,14 +294,32 @@ class MujocoRobot:
 
     def command(self, target: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:
         if self.options.action_delay <= 0:
-            self._apply(target, stiffness, damping)
+            self.servo(target, stiffness, damping)
             return
         at = float(self.data.time) + self.options.action_delay
         self._commands.append((at, np.array(target), np.array(stiffness), np.array(damping)))
 
-    def _apply(self, target: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:
+    def servo(
+        self,
+        target: np.ndarray,
+        stiffness: np.ndarray,
+        damping: np.ndarray,
+        velocity: np.ndarray | float = 0.0,
+        torque: np.ndarray | float = 0.0,
+    ) -> None:
+        """What the servos do from now on: stiffness (target - q) + damping (velocity - qd) + torque, within limits.
+
+        Damping by the joint's own velocity is the joint's, and not limited.
+
+        Args:
+            target: rad [J].
+            stiffness, damping: N m/rad and N m s/rad [J].
+            velocity: rad/s [J].
+            torque: N m [J].
+        """
         model, servos = self.model, self._servos
         model.actuator_gainprm[servos, 0] = stiffness
+        model.actuator_biasprm[servos, 0] = damping * velocity + torque
         model.actuator_biasprm[servos, 1] = -np.asarray(stiffness)
         model.dof_damping[self._dof] = damping
         self.data.ctrl[servos] = target
@@ -306,7 +327,10 @@ class MujocoRobot:
     def damp(self) -> None:
         self._commands.clear()
         zero = np.zeros(len(self._servos))
-        self._apply(zero, zero, self.description.damping)
+        self.servo(zero, zero, self.description.damping)
+
+    def remarks(self) -> tuple[str, ...]:
+        return ()
 
     def close(self) -> None:
         self.damp()
@@ -315,6 +339,9 @@ class MujocoRobot:
             self._viewer = None
 
     def _show(self) -> None:
+        if self._viewer is not None and 0.0 <= self.data.time - self._shown < 0.01:
+            return
+        self._shown = float(self.data.time)
         if self._viewer is None:
             import mujoco.viewer
 
@@ -328,4 +355,4 @@ def connect(description: Description, folder: Path, options: Options) -> MujocoR
     Raises:
         PolicyError: if the file is not there or is another robot's.
     """
-    return MujocoRobot(description, folder if folder.suffix == ".xml" else folder / SCENE_FILE, options)
+    return MujocoRobot(description, scene_of(folder), options)

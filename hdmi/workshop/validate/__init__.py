@@ -15,10 +15,10 @@ from typing import Literal
 
 from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig, g1_robot
 from hdmi.config import ConfigError
+from hdmi.motion.dynamics import Dynamics, inverse_dynamics
 from hdmi.motion.format import Motion, MotionError
 from hdmi.motion.playback import make_playback
 from hdmi.workshop.validate import checks
-from hdmi.workshop.validate.dynamics import Dynamics, inverse_dynamics
 from hdmi.workshop.validate.limits import LIMITS, Limit
 from hdmi.workshop.validate.report import Fault, Finding, Report, Series, Verdict, judge
 
@@ -72,19 +72,18 @@ def validate_motion(
         playback = make_playback(motion, robot=robot, object=object, scenery=scenery, effectors=effectors)
     except MotionError as error:
         return unreadable(motion.name, error, motion)
-    gap = checks.ground_gap(playback)
-    dynamics = inverse_dynamics(playback, gap)
+    dynamics = inverse_dynamics(playback)
     series = {
-        **checks.consistency(playback),
+        **checks.consistency(motion, playback),
         **checks.limits(playback),
-        **checks.smoothness(playback),
+        **checks.smoothness(motion),
         "torque": checks.torque(dynamics),
-        **checks.ground(playback, dynamics, gap),
+        **checks.ground(playback, dynamics),
         **checks.objects(playback, dynamics),
         **checks.labels(playback, tolerance, reduce),
     }
     described = [item.name for item in scenery] + ([object.name] if object is not None else [])
-    notes = checks.missing_parts(playback, described)
+    notes = checks.missing_parts(motion, playback, described)
     if effectors and motion.object_contact is None:
         notes.append("no contact labels: none is taken to be intended")
     findings = tuple(judge(check, series.get(check), limit) for check, limit in limits.items())

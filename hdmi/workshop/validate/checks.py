@@ -9,11 +9,11 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
 from hdmi.assets import g1
+from hdmi.motion.dynamics import Dynamics
 from hdmi.motion.format import Motion
 from hdmi.motion.kinematics import derivative, forward_kinematics
-from hdmi.motion.playback import FAR, Playback
+from hdmi.motion.playback import FAR, TOUCH, Playback
 from hdmi.workshop.annotate import label_contacts
-from hdmi.workshop.validate.dynamics import TOUCH, Dynamics
 from hdmi.workshop.validate.report import Series
 
 _PLANTED = 0.01  # m; a foot's point this near the ground (or the height at which it stands) stands on it
@@ -22,9 +22,8 @@ _AT_REST = 0.05  # m/s
 _SETTLING = 2  # frames after landing and before taking off in which a foot may move
 
 
-def consistency(playback: Playback) -> dict[str, Series]:
+def consistency(motion: Motion, playback: Playback) -> dict[str, Series]:
     """Joints that are there, bodies against forward kinematics, velocities against differences of positions."""
-    motion = playback.motion
     robot = [name for name in motion.body_names if name in g1.BODY_NAMES]
     rows, columns = [g1.BODY_NAMES.index(n) for n in robot], [motion.body_names.index(n) for n in robot]
     qpos = playback.qpos
@@ -78,9 +77,9 @@ def torque(dynamics: Dynamics) -> Series:
     return Series(np.abs(dynamics.torque) / np.array(g1.EFFORT_LIMITS), g1.JOINT_NAMES)
 
 
-def smoothness(playback: Playback) -> dict[str, Series]:
+def smoothness(motion: Motion) -> dict[str, Series]:
     """Second and third differences; a jump shows as a large acceleration in the frames around it."""
-    motion, fps = playback.motion, playback.fps
+    fps = motion.fps
     acceleration = np.linalg.norm(_difference(motion.body_pos_w, 2), axis=-1) * fps**2
     jerk = np.linalg.norm(_difference(motion.body_pos_w, 3), axis=-1) * fps**3
     joint_acceleration = np.abs(_difference(motion.joint_pos, 2)) * fps**2
@@ -100,36 +99,17 @@ def _difference(values: np.ndarray, order: int) -> np.ndarray:
     return out
 
 
-def clearance(playback: Playback) -> np.ndarray:
-    """Distances of the robot's geoms from what it may stand on, m. [T, R]
-
-    That is the ground, and an object that stands itself; but not on its arms there: those hold it.
-    """
-    scene = playback.scene
-    if not scene.object_geoms.size:
-        return playback.ground_distance
-    names = [_geom_name(playback, g) for g in playback.robot_geoms]
-    on_arms = np.array([any(word in name for word in ("shoulder", "elbow", "wrist", "hand")) for name in names])
-    stands = (playback.object_clearance.min(axis=1) < TOUCH) | (scene.object_free_dof is None)
-    return np.minimum(playback.ground_distance, np.where(stands[:, None] & ~on_arms, playback.object_distance, np.inf))
-
-
-def ground_gap(playback: Playback) -> float:
-    """Height of the robot's lowest point over what it may stand on in the median frame, m; 0 if it is on or in it."""
-    return max(float(np.median(clearance(playback).min(axis=1))), 0.0)
-
-
-def ground(playback: Playback, dynamics: Dynamics, gap: float) -> dict[str, Series]:
+def ground(playback: Playback, dynamics: Dynamics) -> dict[str, Series]:
     """Standing: clearance, penetration, slide, and what inverse dynamics asks of the ground."""
-    names = [_geom_name(playback, g) for g in playback.robot_geoms]
-    to_ground, from_support = playback.ground_distance, clearance(playback)
+    names = [playback.geom_name(g) for g in playback.robot_geoms]
+    to_ground, from_support = playback.ground_distance, playback.clearance
     floating = from_support.min(axis=1, keepdims=True).clip(min=0)
     floating[dynamics.in_flight] = np.nan
     return {
         "standing_height": Series(floating, ["robot"]),
         "floating": Series(floating, ["robot"]),
         "ground_penetration": Series((-to_ground).clip(min=0), names),
-        "foot_slide": Series(_slide(playback, _standing_clearance(playback, from_support), gap), g1.FEET),
+        "foot_slide": Series(_slide(playback, _standing_clearance(playback, from_support)), g1.FEET),
         "ground_force": Series(dynamics.missing_force[:, None], ["robot"]),
         "centre_of_pressure": Series(dynamics.cop_distance[:, None], ["robot"]),
     }
@@ -145,7 +125,7 @@ def _standing_clearance(playback: Playback, from_support: np.ndarray) -> np.ndar
     return out
 
 
-def _slide(playback: Playback, from_support: np.ndarray, gap: float) -> np.ndarray:
+def _slide(playback: Playback, from_support: np.ndarray) -> np.ndarray:
     """Horizontal speed of the slowest of a foot's points on the ground; NaN while it swings or has just landed. [T, 2]
 
     A foot close to the ground that is fast while the other one stands is taken to swing.
@@ -153,7 +133,7 @@ def _slide(playback: Playback, from_support: np.ndarray, gap: float) -> np.ndarr
     of_foot = [playback.on_bodies([foot]) for foot in g1.FEET]
     pos = np.stack([data.geom_xpos[playback.robot_geoms] for data in playback.frames()])  # [T, R, 3]
     speed = np.linalg.norm(derivative(pos, playback.fps)[..., :2], axis=-1)
-    speed = np.where(from_support <= gap + _PLANTED, speed, np.inf)
+    speed = np.where(from_support <= playback.ground_gap + _PLANTED, speed, np.inf)
     slide = np.stack([speed[:, geoms].min(axis=1, initial=np.inf) for geoms in of_foot], axis=1)
     swings = (slide > _SWING) & (slide[:, ::-1] < _SWING)
     planted = np.isfinite(slide) & ~swings
@@ -166,7 +146,7 @@ def objects(playback: Playback, dynamics: Dynamics) -> dict[str, Series]:
     scene = playback.scene
     if not scene.object_geoms.size:
         return {}
-    names = np.array([_geom_name(playback, geom) for geom in playback.robot_geoms])
+    names = np.array([playback.geom_name(geom) for geom in playback.robot_geoms])
     of_effectors = playback.on_bodies([effector.body for effector in scene.effectors])
     depth = (-playback.object_distance).clip(min=0)
     out = {
@@ -177,7 +157,7 @@ def objects(playback: Playback, dynamics: Dynamics) -> dict[str, Series]:
         out["grip_depth"] = Series(depth[:, of_effectors], names[of_effectors])
     if scene.object_free_dof is not None:
         clearance = playback.object_clearance
-        geoms = [_geom_name(playback, g) for g in scene.object_geoms]
+        geoms = [playback.geom_name(g) for g in scene.object_geoms]
         out["object_in_ground"] = Series((-clearance).clip(min=0), geoms)
         floating = clearance.min(axis=1, keepdims=True).clip(min=0)
         floating[~_left_alone(playback)] = np.nan
@@ -225,28 +205,21 @@ def labels(playback: Playback, tolerance: float = 0.0, reduce: str = "mean") -> 
     }
 
 
-def _geom_name(playback: Playback, geom: int) -> str:
-    model = playback.scene.model
-    return model.geom(geom).name or model.body(model.geom_bodyid[geom]).name
-
-
-def missing_parts(playback: Playback, described: Sequence[str]) -> list[str]:
+def missing_parts(motion: Motion, playback: Playback, described: Sequence[str]) -> list[str]:
     """Notes on what was filled in and what nothing is known about."""
-    motion = playback.motion
     notes = []
     if absent := [name for name in g1.JOINT_NAMES if name not in motion.joint_names]:
         notes.append(f"{len(absent)} joints are absent and hold the default pose: {', '.join(absent)}")
     known = {*g1.BODY_NAMES, *described}
     # bodies of other robot descriptions stand for no object: they are rigid with the robot's
-    unknown = [name for name in motion.body_names if name not in known and not moves_with_robot(playback, name)]
+    unknown = [name for name in motion.body_names if name not in known and not moves_with_robot(motion, playback, name)]
     if unknown:
         notes.append(f"no geometry is known of {', '.join(unknown)}: name the task that describes them")
     return notes
 
 
-def moves_with_robot(playback: Playback, name: str) -> bool:
+def moves_with_robot(motion: Motion, playback: Playback, name: str) -> bool:
     """Whether a body moves, and keeps its distance from one of the robot's all along."""
-    motion = playback.motion
     pos = motion.body_pos_w[:, motion.body_names.index(name)]
     apart = np.linalg.norm(playback.reference.body_pos.numpy() - pos[:, None], axis=-1)  # [T, B]
     return bool(np.ptp(pos, axis=0).max() > 0.01 and (np.ptp(apart, axis=0) < 1e-3).any())

@@ -55,7 +55,7 @@ class ReferenceViewer:
         self._curves = curves(playback, ghost)
         self._time = np.arange(playback.num_frames) / playback.fps
         self.frame = 0
-        self.server = viser.ViserServer(host=host, port=port, label=playback.motion.name, verbose=False)
+        self.server = viser.ViserServer(host=host, port=port, label=playback.reference.name, verbose=False)
         self._add_scene()
         self._add_controls()
         self.show(0)

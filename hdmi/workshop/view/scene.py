@@ -62,7 +62,9 @@ def _task_of(motion: Motion, config_dir: str | None) -> str | None:
 def _bare_playback(motion: Motion) -> Playback:
     motion = motion.with_joints(g1.JOINT_NAMES)
     robot = make_playback(motion)
-    others = [name for name in motion.body_names if name not in g1.BODY_NAMES and not moves_with_robot(robot, name)]
+    others = [
+        name for name in motion.body_names if name not in g1.BODY_NAMES and not moves_with_robot(motion, robot, name)
+    ]
     if not others:
         return robot
     travel = np.ptp(motion.body_pos_w, axis=0).max(axis=-1)

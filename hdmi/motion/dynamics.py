@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import nnls
 
-from hdmi.assets import g1
-from hdmi.motion.playback import Playback
+from hdmi.assets import Scene
+from hdmi.motion.playback import TOUCH, Playback, reference_qpos
+from hdmi.motion.reference import Reference
 
-TOUCH = 0.02  # m; surfaces this near each other can push
 _REACH = 0.12  # m; an effector whose contact is intended can push from this far, and feet over this gap at most
 _SLIDING = 0.05  # m/s; from here on friction of an object opposes its sliding
 _UNSUPPORTED = 0.1  # body weights; with more than this missing there is no support to find a centre of pressure in
@@ -22,6 +23,7 @@ _LEVER = 1.0  # m; lever arm that weighs moments against forces, on the robot
 _OBJECT_LEVER = 0.3  # m; likewise on the object
 _EASE = 0.03  # weight of small torques against the balance of forces
 _HOLD = 30.0  # how much more torques count beyond the effort limits
+_SMOOTHING = 2.0  # frames; standard deviation
 
 
 @dataclass(frozen=True)
@@ -36,28 +38,35 @@ class Dynamics:
 
     Examples:
         >>> from hdmi.motion import find_motion, load_motion, make_playback
-        >>> dynamics = inverse_dynamics(make_playback(load_motion(find_motion("walk"))), ground_gap=0.0)
+        >>> dynamics = inverse_dynamics(make_playback(load_motion(find_motion("walk"))))
         >>> dynamics.torque.shape, bool(dynamics.in_flight.any())
         ((550, 29), False)
     """
 
-    torque: np.ndarray  # [T, 29] N m
+    torque: np.ndarray  # [T, J] N m
     missing_force: np.ndarray  # [T] that nothing gives the robot, in body weights
     in_flight: np.ndarray  # bool [T]; falls nearly freely, so that it needs no ground
     cop_distance: np.ndarray  # [T] m, of the needed centre of pressure from the support; NaN without support
     object_force: np.ndarray  # [T] that nothing gives the object, in its weights; NaN without a free object
 
 
-def inverse_dynamics(playback: Playback, ground_gap: float) -> Dynamics:
-    """Explains a motion by forces of contacts, see `Dynamics`.
-
-    Args:
-        ground_gap: height of the soles over the ground while the robot stands, m: contacts bridge it.
-    """
-    solver = _Solver(playback, min(ground_gap, _REACH - TOUCH))
+def inverse_dynamics(playback: Playback) -> Dynamics:
+    """Explains a motion by forces of contacts, see `Dynamics`; they bridge the `ground_gap`."""
+    solver = _Solver(playback, min(playback.ground_gap, _REACH - TOUCH))
     qvel, qacc = playback.derivatives()
     rows = [solver.solve(t, qvel[t], qacc[t]) for t in range(playback.num_frames)]
     return Dynamics(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def reference_torque(scene: Scene, reference: Reference) -> np.ndarray:
+    """Joint torques that a reference asks for in its scene, N m, smoothed over some frames. [T, J]
+
+    See `inverse_dynamics`; contacts that switch from one frame to the next make its torques jump.
+    """
+    reference = reference.to("cpu")
+    playback = Playback(reference, scene, reference_qpos(scene, reference), 1 / scene.sim.control_dt)
+    smooth: np.ndarray = gaussian_filter1d(inverse_dynamics(playback).torque, _SMOOTHING, axis=0, mode="nearest")
+    return smooth
 
 
 class _Solver:
@@ -76,12 +85,13 @@ class _Solver:
         self.object &= link_moves[model.geom_bodyid]
         self.effector_of_body = {model.body(e.body).id: i for i, e in enumerate(scene.effectors)}
         self.contact = playback.reference.contact.numpy()
+        self.effort = np.array(scene.robot.effort_limits)
 
-        weight = _GRAVITY * g1.TOTAL_MASS
+        weight = _GRAVITY * scene.robot.total_mass
         self.weight = weight
         self.row_weight = np.zeros(model.nv)
         self.row_weight[:3], self.row_weight[3:6] = 3 / weight, 1 / (weight * _LEVER)
-        self.row_weight[scene.joint_dof] = _EASE / np.array(g1.EFFORT_LIMITS)
+        self.row_weight[scene.joint_dof] = _EASE / self.effort
         self.object_weight = 0.0
         if (v := scene.object_free_dof) is not None:
             self.object_weight = _GRAVITY * float(model.body_subtreemass[scene.object_body])
@@ -117,7 +127,7 @@ class _Solver:
         if not generators.size:
             return needed
         weight, target = self.row_weight.copy(), needed.copy()
-        dofs, effort = self.playback.scene.joint_dof, np.array(g1.EFFORT_LIMITS)
+        dofs, effort = self.playback.scene.joint_dof, self.effort
         held, left = np.zeros(len(dofs), bool), needed
         while True:
             try:
