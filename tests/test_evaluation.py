@@ -479,7 +479,7 @@ def test_a_window_needs_a_display(monkeypatch: pytest.MonkeyPatch, capsys: pytes
 @pytest.mark.parametrize(
     ("name", "arguments", "message"),
     [
-        ("evaluate", [], "give either checkpoint=RUN or agent=, one of zero, random"),
+        ("evaluate", [], "give one of checkpoint=RUN, policy=FILE.yaml, or agent=, one of zero, random"),
         (
             "evaluate",
             ["agent=zero", "task=walk", "without=[lost_contact]"],

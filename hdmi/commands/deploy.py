@@ -4,6 +4,8 @@
     hdmi deploy policy=FOLDER robot=unitree interface=eth0 log=FILE.npz  # keys: s start, r run, h hold, space damping
     hdmi deploy policy=FOLDER replay=FILE.npz [plot=FILE.png]         # the graph over logged sensors
 
+Instead of a folder, FILE.yaml: what describes a network of others, or that of `hdmi export` in the same words.
+
 With `episodes`, a simulated robot begins each episode at the perturbed first frame, and a table shows success, errors
 and timing. Without, the run goes through all states: damping, to the start, run, hold, damping; by itself if
 auto=true, else as keys, a gamepad or the robot's remote control ask for. It always ends in damping.
@@ -27,12 +29,15 @@ from hdmi.commands.deployed import run_deployed
 from hdmi.commands.options import parse_parts, shown_help
 from hdmi.deploy import runner, safety
 from hdmi.deploy.controls import Controls, Gamepad, Keyboard
+from hdmi.deploy.description import PolicyError
 from hdmi.deploy.log import read_log, replay
 from hdmi.deploy.policy import Policy
+from hdmi.deploy.trial import read_reference
 from hdmi.errors import ConfigError
 
 # Modules of hdmi.deploy.robots.
 ROBOTS = ("mujoco", "unitree")
+YAML = (".yaml", ".yml")  # of descriptions
 TOLERANCE = 1e-4  # rad that a replayed target may be off: another machine, another rounding
 
 
@@ -40,7 +45,7 @@ TOLERANCE = 1e-4  # rad that a replayed target may be off: another machine, anot
 class Options:
     """See the module."""
 
-    policy: str | None = None  # folder of policy.onnx, or the file
+    policy: str | None = None  # folder of policy.onnx, or the file; or a YAML that describes a network
     robot: str | None = None
     episodes: int = 0  # of a simulated robot
     replay: str | None = None  # a log
@@ -69,19 +74,34 @@ def run(arguments: list[str], console: Console) -> int:
     """Does what the options ask for; returns the exit status."""
     options, values, module = _parse(arguments)
     if options.policy is None:
-        raise ConfigError("give policy=FOLDER, that of an exported policy.onnx")
-    policy = Policy(options.policy)
+        raise ConfigError("give policy=FOLDER, that of an exported policy.onnx, or policy=FILE.yaml")
+    policy = _policy(options.policy)
     if options.replay is not None:
         return _replay(options, policy, console)
     if module is None:
         raise ConfigError(f"give robot=NAME, one of {', '.join(ROBOTS)}, or replay=LOG")
-    robot = module.connect(policy.description, policy.path.parent, values[module.Options])
+    files = policy.scene if policy.path.suffix in YAML else policy.path.parent
+    robot = module.connect(policy.description, files, values[module.Options])
     try:
         if options.episodes > 0:
             return _episodes(options, values, policy, robot, console)
         return _drive(options, values, policy, robot, console)
     finally:
         robot.close()
+
+
+def _policy(path: str) -> Any:
+    """An exported policy, or what a YAML describes, which has its interface."""
+    if not path.endswith(YAML):
+        return Policy(path)
+    from hdmi.deploy.foreign.policy import ForeignPolicy  # needs PyYAML
+
+    return ForeignPolicy(path)
+
+
+def _reference(policy: Any) -> dict[str, np.ndarray]:
+    """The policy's motion."""
+    return policy.reference if policy.path.suffix in YAML else read_reference(policy.path.parent, policy.description)
 
 
 def _drive(options: Options, values: dict[type, Any], policy: Policy, robot: Any, console: Console) -> int:
@@ -112,11 +132,11 @@ def _drive(options: Options, values: dict[type, Any], policy: Policy, robot: Any
 def _episodes(options: Options, values: dict[type, Any], policy: Policy, robot: Any, console: Console) -> int:
     """Episodes of a simulated robot, and their figures; log and plot are of the last."""
     from hdmi.deploy.robots.mujoco import MujocoRobot
-    from hdmi.deploy.trial import Judge, Result, read_reference
+    from hdmi.deploy.trial import Judge, Result
 
     if not isinstance(robot, MujocoRobot):
         raise ConfigError(f"episodes: only of robot=mujoco, which can be put back to the start, not of {options.robot}")
-    judge = Judge(robot, read_reference(policy.path.parent, policy.description))
+    judge = Judge(robot, _reference(policy))
     results = []
     how = replace(values[runner.Options], hold=0.0)
     for episode in range(options.episodes):
@@ -173,7 +193,15 @@ def _finish(options: Options, drive: Any, policy: Policy) -> None:
         from hdmi.deploy.plots import plot_log
 
         header = drive.log.header | {"events": drive.log.events}
-        print(plot_log(header, drive.log.arrays(), policy.description, options.plot, policy.path.parent))
+        print(plot_log(header, drive.log.arrays(), policy.description, options.plot, _shown_reference(policy)))
+
+
+def _shown_reference(policy: Policy) -> dict[str, np.ndarray] | None:
+    """The motion to draw, if it is there."""
+    try:
+        return _reference(policy)
+    except PolicyError:
+        return None
 
 
 def _replay(options: Options, policy: Policy, console: Console) -> int:
@@ -187,7 +215,7 @@ def _replay(options: Options, policy: Policy, console: Console) -> int:
     if options.plot is not None:
         from hdmi.deploy.plots import plot_log
 
-        print(plot_log(header, arrays, policy.description, options.plot, policy.path.parent))
+        print(plot_log(header, arrays, policy.description, options.plot, _shown_reference(policy)))
     if differences.max() > TOLERANCE:
         print(f"that is more than {TOLERANCE:g} rad: not what the policy has done", file=sys.stderr)
         return 1

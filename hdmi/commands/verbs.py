@@ -15,6 +15,7 @@ VERBS = {
     "export": "writes a policy alone, with evaluation, video and a card",
     "deploy": "runs an exported policy on a robot, real or simulated",
     "simulate-robot": "a simulated robot that talks as the real one does, for deploy robot=unitree",
+    "foreign": "brings in networks of others: describes one, checks it",
     "tasks": "lists the tasks, checks them, or renders a picture of each",
     "retarget": "from a person's motion to the robot's",
     "convert": "reference motions from and to other projects' formats",

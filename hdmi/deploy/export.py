@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,15 +18,16 @@ from torch import Tensor, nn
 
 import hdmi
 from hdmi.assembly import Task, make_env, make_task, make_transforms
-from hdmi.deploy.format import FORMAT, GRAPH_FILE, REFERENCE_FILE, SCENE_FILE, SENSORS, DeploymentError
+from hdmi.deploy.foreign.own import write_own
+from hdmi.deploy.format import FORMAT, GRAPH_FILE, REFERENCE_FILE, SCENE_FILE, SENSORS, SPEC_FILE, DeploymentError
 from hdmi.deploy.graph import UNMEASURED, Measured, PolicyGraph, name_of
 from hdmi.deploy.rotations import tilt_of
+from hdmi.deploy.trace import trace
 from hdmi.learning.checkpoint import find_checkpoint, load_checkpoint
 from hdmi.learning.policy import make_networks
 from hdmi.motion import Reference
 from hdmi.names import match_names
 
-OPSET = 20
 # Errors that follow from poses of robot and object and from the motion.
 COMPARED = ("root_pos", "root_ori", "body_pos", "body_ori", "object_pos", "object_ori", "object_joint")
 
@@ -69,23 +69,7 @@ def to_onnx(graph: PolicyGraph) -> onnx.ModelProto:
     Raises:
         DeploymentError: if they depend on what no sensor gives; names the observation terms.
     """
-    inputs = graph.inputs
-    noisy = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
-    levels = [logger.level for logger in noisy]
-    for logger in noisy:
-        logger.setLevel(logging.ERROR)
-    try:
-        with torch.no_grad(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            program = torch.onnx.export(
-                graph.eval(), tuple(inputs.values()), input_names=list(inputs), output_names=graph.outputs,
-                opset_version=OPSET, dynamo=True, external_data=False, verbose=False,
-            )  # fmt: skip
-    finally:
-        for logger, level in zip(noisy, levels, strict=True):
-            logger.setLevel(level)
-    assert program is not None
-    model = program.model_proto
+    model = trace(graph, graph.inputs, graph.outputs)
     used = _reached(model)
     for key in graph.others:
         if f"{UNMEASURED}.{name_of(key)}" in used:
@@ -115,6 +99,9 @@ def _reached(model: onnx.ModelProto) -> set[str]:
 def export_graph(checkpoint: str | Path, folder: str | Path) -> Path:
     """Writes `policy.onnx`, `scene.xml`, the scene as self-contained MJCF, and `reference.npz` into a folder.
 
+    Beside them, for others' runners, what `hdmi.deploy.foreign.own.write_own` writes; a warning says why not, if a term
+    of the policy has no name there.
+
     Args:
         checkpoint: a run folder (its newest checkpoint counts), an exported policy, or a checkpoint file.
         folder: is made if it is not there.
@@ -134,7 +121,12 @@ def export_graph(checkpoint: str | Path, folder: str | Path) -> Path:
     actor.load_state_dict(state["actor"])
     graph, task = make_graph(cfg, actor)
     digest = hashlib.sha256(json.dumps(state["config"], sort_keys=True).encode()).hexdigest()
-    return write_graph(cfg, graph, task, folder, {"config_hash": digest, "training_frames": str(state["frames"])})
+    path = write_graph(cfg, graph, task, folder, {"config_hash": digest, "training_frames": str(state["frames"])})
+    try:
+        write_own(graph, task, trial_of(cfg, task), folder)
+    except DeploymentError as error:  # the graph is whole without it
+        warnings.warn(f"no {SPEC_FILE}: {error}", stacklevel=2)
+    return path
 
 
 def write_graph(
@@ -157,6 +149,20 @@ def write_graph(
     return folder / GRAPH_FILE
 
 
+def trial_of(cfg: DictConfig, task: Task) -> dict[str, Any]:
+    """What an evaluation in another simulation goes by, as `hdmi.deploy.foreign.schema.NetworkSpec` has it."""
+    terminations, unchecked = _terminations(cfg)
+    robot = task.scene.robot
+    return {
+        "start_noise": _start_noise(cfg, task.reference),
+        "terminations": terminations,
+        "unchecked": unchecked,
+        "tracked_joints": _matching(cfg, "joints", robot.joint_names),
+        "tracked_bodies": _matching(cfg, "bodies", robot.body_names),
+        "object_joint_ranges": _object_joint(cfg),
+    }
+
+
 def metadata_of(cfg: DictConfig, graph: PolicyGraph, task: Task) -> dict[str, str]:
     """What a runner has to know, by name: lists with commas between, mappings as JSON; SI units.
 
@@ -174,7 +180,7 @@ def metadata_of(cfg: DictConfig, graph: PolicyGraph, task: Task) -> dict[str, st
         "root_lin_vel_w": reference.body_lin_vel[0, 0].numpy(),
         "root_ang_vel_w": reference.body_ang_vel[0, 0].numpy(),
     }
-    known, unchecked = _terminations(cfg)
+    trial = trial_of(cfg, task)
     inputs = {name: {"shape": list(shape)} | SENSORS[name] for name, shape in graph.measured.sensors.items()}
     return {
         "format": FORMAT,
@@ -202,12 +208,12 @@ def metadata_of(cfg: DictConfig, graph: PolicyGraph, task: Task) -> dict[str, st
         "state": json.dumps({name.removeprefix("state."): value.tolist() for name, value in _state(graph).items()}),
         "start": json.dumps({name: value.tolist() for name, value in start.items()}),
         "max_tilt": str(float(tilt_of(arrays["root_quat_w"]).max())),
-        "start_noise": json.dumps(_start_noise(cfg, reference)),
-        "tracked_joints": ",".join(_matching(cfg, "joints", robot.joint_names)),
-        "tracked_bodies": ",".join(_matching(cfg, "bodies", robot.body_names)),
-        "object_joint": json.dumps(_object_joint(cfg)),
-        "terminations": json.dumps(known),
-        "unchecked_terminations": ",".join(unchecked),
+        "start_noise": json.dumps(trial["start_noise"]),
+        "tracked_joints": ",".join(trial["tracked_joints"]),
+        "tracked_bodies": ",".join(trial["tracked_bodies"]),
+        "object_joint": json.dumps(trial["object_joint_ranges"]),
+        "terminations": json.dumps(trial["terminations"]),
+        "unchecked_terminations": ",".join(trial["unchecked"]),
         "quaternions": "wxyz",
     }
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 
 class DeploymentError(ValueError):
     """A policy that cannot leave the trainer; the message names what is wrong with it."""
@@ -11,6 +13,7 @@ FORMAT = "hdmi-policy/1"
 GRAPH_FILE = "policy.onnx"
 SCENE_FILE = "scene.xml"
 REFERENCE_FILE = "reference.npz"
+NETWORK_FILE, SPEC_FILE, MOTION_FOLDER = "network.onnx", "policy.yaml", "motion"  # for other runners
 TARGET = "joint_pos_target"  # rad, [J]
 
 # World frame, quaternions wxyz, SI units.
@@ -29,3 +32,8 @@ SENSORS: dict[str, dict[str, str]] = {
 REFERENCE = (
     "joint_pos", "root_pos_w", "root_quat_w", "object_pos_w", "object_quat_w", "object_joint_pos",
 )  # fmt: skip
+
+
+def scene_of(files: Path) -> Path:
+    """The scene's file, of a policy's folder, or that file itself."""
+    return files if files.suffix == ".xml" else files / SCENE_FILE

@@ -11,10 +11,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hdmi.deploy.description import Description, PolicyError
+from hdmi.deploy.description import Description
 from hdmi.deploy.log import LogError
 from hdmi.deploy.rotations import quat_angle
-from hdmi.deploy.trial import read_reference
 
 _SHADES = {"damping": "0.85", "to_start": "#dbe9f6", "run": "white", "hold": "#f6ecd6"}
 _SHOWN_JOINTS = 6
@@ -25,7 +24,7 @@ def plot_log(
     arrays: Mapping[str, np.ndarray],
     description: Description,
     out: str | Path,
-    folder: str | Path | None = None,
+    reference: dict[str, np.ndarray] | None = None,
 ) -> Path:
     """Draws a log's rows.
 
@@ -33,7 +32,7 @@ def plot_log(
         header, arrays: of `hdmi.deploy.log.read_log`.
         description: of the policy.
         out: the picture.
-        folder: with the motion, `reference.npz`; without it tracking is shown against targets alone.
+        reference: the motion, of `hdmi.deploy.trial.read_reference`; without it targets alone are shown.
 
     Raises:
         LogError: if the log has no ticks.
@@ -43,7 +42,6 @@ def plot_log(
         raise LogError("the log has no ticks to draw")
     time = arrays["time"] - arrays["time"][0]
     frame = arrays["frame"]
-    reference = _reference(folder, description)
     ran = frame >= 0
     figure = Figure(figsize=(13, 15))
     FigureCanvasAgg(figure)
@@ -82,15 +80,6 @@ def plot_log(
     figure.savefig(partial, dpi=110, format=out.suffix.removeprefix(".") or "png")
     os.replace(partial, out)
     return out
-
-
-def _reference(folder: str | Path | None, description: Description) -> dict[str, np.ndarray] | None:
-    if folder is None:
-        return None
-    try:
-        return read_reference(folder, description)
-    except PolicyError:
-        return None
 
 
 def _joint_errors(

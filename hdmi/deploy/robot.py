@@ -45,7 +45,7 @@ class Robot(Protocol):
     - `Options`: a dataclass of what can be set, as `key=value` on the command line, fields of type str, int, float,
       bool or a list of one of these, or one of these or None, all with defaults;
     - `connect(description, folder, options) -> Robot`: from the `hdmi.deploy.description.Description` of the policy
-      that is to run, the folder of its files and the options.
+      that is to run, the folder of its files, or its scene's file where that lies elsewhere, and the options.
 
     Attributes:
         joint_names: [J], the order of joints in readings and commands.

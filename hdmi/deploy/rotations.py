@@ -28,8 +28,15 @@ def quat_conjugate(quat: np.ndarray) -> np.ndarray:
 def quat_apply(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Rotates vectors. [..., 4], [..., 3] -> [..., 3]"""
     axis = quat[..., 1:]
-    turned = 2.0 * np.cross(axis, vector)
-    return vector + quat[..., :1] * turned + np.cross(axis, turned)
+    turned = 2.0 * _cross(axis, vector)
+    return vector + quat[..., :1] * turned + _cross(axis, turned)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The cross product, for few vectors several times as fast as numpy's. [..., 3], [..., 3] -> [..., 3]"""
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    X, Y, Z = b[..., 0], b[..., 1], b[..., 2]  # noqa: N806
+    return np.stack([y * Z - z * Y, z * X - x * Z, x * Y - y * X], axis=-1)
 
 
 def quat_apply_inverse(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
@@ -48,6 +55,25 @@ def quat_from_rotation_vector(vector: np.ndarray) -> np.ndarray:
     half = 0.5 * np.linalg.norm(vector, axis=-1, keepdims=True)
     # sin(x) / x, also at 0
     return np.concatenate([np.cos(half), 0.5 * vector * np.sinc(half / np.pi)], axis=-1)
+
+
+def rotation_vector(quat: np.ndarray) -> np.ndarray:
+    """Axis times angle of the shorter way round, rad. [..., 4] -> [..., 3]"""
+    quat = np.where(quat[..., :1] < 0, -quat, quat)
+    sine = np.linalg.norm(quat[..., 1:], axis=-1, keepdims=True)
+    half = np.arctan2(sine, quat[..., :1])
+    return 2.0 * quat[..., 1:] * np.where(sine > 1e-9, half / np.maximum(sine, 1e-9), 1.0)
+
+
+def matrix_of(quat: np.ndarray) -> np.ndarray:
+    """Rotation matrices. [..., 4] -> [..., 3, 3]"""
+    w, x, y, z = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
+    entries = (
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
+    return np.stack(entries, axis=-1).reshape(*quat.shape[:-1], 3, 3)
 
 
 def quat_from_euler(angles: np.ndarray) -> np.ndarray:

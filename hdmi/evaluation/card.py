@@ -8,7 +8,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from hdmi.deploy.format import GRAPH_FILE, SCENE_FILE
+from hdmi.deploy.format import GRAPH_FILE, NETWORK_FILE, SCENE_FILE, SPEC_FILE
 from hdmi.evaluation.protocol import EvalResult, evaluate_checkpoint, unit_of
 from hdmi.evaluation.video import render_checkpoint
 from hdmi.learning import export_policy, load_checkpoint
@@ -77,10 +77,12 @@ def _graph_lines(folder: Path) -> list[str]:
     """What the card says of the deployment graph, if there is one."""
     if not (folder / GRAPH_FILE).is_file():
         return []
-    size = _megabytes(folder / GRAPH_FILE)
+    size, described = _megabytes(folder / GRAPH_FILE), (folder / SPEC_FILE).is_file()
     return [
         f"`{GRAPH_FILE}` is the policy with its observations and actions as one graph, from sensors to joint position "
-        f"targets ({size} MB); `{SCENE_FILE}` is the scene that it was trained in.",
+        f"targets ({size} MB); `{SCENE_FILE}` is the scene that it was trained in."
+        + f" `{SPEC_FILE}` describes the network alone, `{NETWORK_FILE}`, for other runners."
+        * described,
         "",
     ]
 

@@ -56,6 +56,10 @@ class MotionReference(StateTransform):
         future_steps: control steps ahead.
         out_key: under which the reference goes; `step` there is its state.
 
+    Attributes:
+        tracked_bodies, tracked_joints: names that match, in the robot's order.
+        future_steps: as given.
+
     Examples:
         >>> clock = MotionReference(reference, ["torso_link"], [".*_knee_joint"], g1.BODY_NAMES, g1.JOINT_NAMES)
         >>> td = TransformedEnv(base, clock).rollout(3)
@@ -76,6 +80,8 @@ class MotionReference(StateTransform):
     ):
         joints = match_names(tracked_joints, joint_names, "tracked_joints")
         bodies = match_names(tracked_bodies, body_names, "tracked_bodies")
+        self.tracked_bodies, self.tracked_joints = [body_names[i] for i in bodies], [joint_names[i] for i in joints]
+        self.future_steps = [int(step) for step in future_steps]
         tables = _reference_table(reference, bodies, joints, future_steps)
         table = {below(out_key, key): value for key, value in tables.items()}
         self.step_key, self._base_key = below(out_key, "step"), below(out_key, "joint_pos")

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from hdmi.deploy.description import Description, PolicyError
-from hdmi.deploy.format import SCENE_FILE
+from hdmi.deploy.format import scene_of
 from hdmi.deploy.line import Line
 from hdmi.deploy.robot import Reading
 from hdmi.deploy.rotations import quat_from_euler, quat_from_rotation_vector, quat_multiply
@@ -350,9 +350,9 @@ class MujocoRobot:
 
 
 def connect(description: Description, folder: Path, options: Options) -> MujocoRobot:
-    """The robot of a policy's `scene.xml`.
+    """The robot of a policy's `scene.xml`, or of the MJCF file that is given instead of the folder.
 
     Raises:
         PolicyError: if the file is not there or is another robot's.
     """
-    return MujocoRobot(description, folder / SCENE_FILE, options)
+    return MujocoRobot(description, scene_of(folder), options)

@@ -20,7 +20,7 @@ import numpy as np
 
 from hdmi.deploy import g1, mocap
 from hdmi.deploy.description import Description, PolicyError
-from hdmi.deploy.format import SCENE_FILE
+from hdmi.deploy.format import scene_of
 from hdmi.deploy.robot import Reading, RobotError
 from hdmi.deploy.scene import Hinge, hinge_of
 
@@ -286,7 +286,7 @@ def connect(description: Description, folder: Path, options: Options) -> Unitree
 
     if options.interface is None:
         raise RobotError("give interface=NAME, the network interface of the robot, such as eth0; lo for simulate_robot")
-    robot = UnitreeRobot(description, options, _hinge(folder / SCENE_FILE))
+    robot = UnitreeRobot(description, options, _hinge(scene_of(folder)))
     bus = dds.Bus(options.interface, options.domain)
     port = dds.Port(bus, g1.COMMAND_TOPIC, g1.STATE_TOPIC)
     poses = None if robot.motion is None else mocap.socket_of("SUB", options.mocap, "mocap")

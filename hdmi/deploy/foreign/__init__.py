@@ -1,0 +1,1 @@
+"""Policies of others: networks that a YAML describes, run in the place of an exported policy. Needs no torch."""
