@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from test_training import config, parameters
 
+from hdmi.errors import ConfigError
 from hdmi.learning import CheckpointError, TeacherStudentTrainer, Trainer, load_policy, make_actor, make_trainer
 from hdmi.learning.networks import network_of
 from hdmi.learning.teacher import TeacherOrStudent
@@ -22,7 +23,9 @@ def weights(actor: torch.nn.Module) -> torch.Tensor:
 
 @pytest.fixture
 def pair() -> TeacherOrStudent:
-    teacher, student = (make_actor(2, 1, [4], "Tanh", noise, False, key) for noise, key in ((0.5, "all"), (0.1, "some")))
+    teacher, student = (
+        make_actor(2, 1, [4], "Tanh", noise, False, key) for noise, key in ((0.5, "all"), (0.1, "some"))
+    )
     return TeacherOrStudent(teacher, student)
 
 
@@ -64,7 +67,9 @@ def test_the_student_learns_throughout_and_the_teacher_while_it_acts(tmp_path: P
         before = weights(trainer.teacher), weights(trainer.policy)
         row = trainer.update(trainer.collector.next())
         trainer.frames += 32
-        changed = [not torch.equal(a, weights(b)) for a, b in zip(before, (trainer.teacher, trainer.policy), strict=True)]
+        changed = [
+            not torch.equal(a, weights(b)) for a, b in zip(before, (trainer.teacher, trainer.policy), strict=True)
+        ]
         moved.append((row["student_acts"], *changed, trainer.lesson.imitation))
     trainer.collector.shutdown()
     assert moved == [(0.0, True, True, 1.0), (0.0, True, True, 1.0), (1.0, False, True, 1.0), (1.0, False, True, 0.5)]
@@ -100,9 +105,10 @@ def test_what_leaves_is_the_student(tmp_path: Path) -> None:
         Trainer(config(f"resume={tmp_path}"), tmp_path)
 
 
-def test_an_unknown_trainer_is_named() -> None:
-    with pytest.raises(ValueError, match=r"algo\.trainer.*nowhere"):
-        make_trainer(config("+algo.trainer=hdmi.learning.nowhere"), Path("run"))
+@pytest.mark.parametrize("path", ["hdmi.learning.nowhere", "hdmi.learning.RunningNorm"])
+def test_what_is_no_trainer_is_named(path: str) -> None:
+    with pytest.raises(ConfigError, match=rf"algo\.trainer: .*{path}"):
+        make_trainer(config(f"+algo.trainer={path}"), Path("run"))
 
 
 def test_parameters_are_the_actors_of_both(tmp_path: Path) -> None:

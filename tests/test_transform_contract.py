@@ -462,7 +462,12 @@ def test_specs_that_are_given_are_left_alone(name):
 
 # What the environment must read besides its own keys, or in another shape, does not pass through a batch of
 # environments: these stand next to the base environment.
-NEXT_TO_THE_BASE = {"ActionDelay", "RandomPush", "SpringAssist", *(name for name in CASES if CASES[name].kind == "init")}
+NEXT_TO_THE_BASE = {
+    "ActionDelay",
+    "RandomPush",
+    "SpringAssist",
+    *(name for name in CASES if CASES[name].kind == "init"),
+}
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if name not in NEXT_TO_THE_BASE])

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tensordict import NestedKey, TensorDictBase
@@ -29,7 +30,7 @@ from torchrl.objectives.utils import KLAdaptiveLR
 from torchrl.objectives.value import GAE
 
 from hdmi.assembly import Task, make_task
-from hdmi.config import build
+from hdmi.config import ConfigError, build, one_line
 from hdmi.console import make_console
 from hdmi.learning.checkpoint import CheckpointError, claim, load_checkpoint, rotate, save_checkpoint, supersede
 from hdmi.learning.distributed import Ranks
@@ -475,9 +476,14 @@ def make_trainer(cfg: DictConfig, folder: Path, evaluate: Evaluate | None = None
     Raises:
         ConfigError: if there is none of that name.
     """
-    node = {"_target_": cfg.algo.get("trainer") or "hdmi.learning.Trainer"}
-    trainer: Trainer = build(node, "algo.trainer", cfg=cfg, folder=folder, evaluate=evaluate)
-    return trainer
+    path = cfg.algo.get("trainer") or "hdmi.learning.Trainer"
+    try:
+        cls = get_object(path)
+    except Exception as error:
+        raise ConfigError(f"algo.trainer: there is no {path!r}: {one_line(error)}") from error
+    if not (isinstance(cls, type) and issubclass(cls, Trainer)):
+        raise ConfigError(f"algo.trainer: {path!r}: a Trainer expected")
+    return cls(cfg, folder, evaluate)
 
 
 @contextmanager
