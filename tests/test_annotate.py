@@ -444,6 +444,17 @@ class TestContacts:
         with pytest.raises(MotionError, match="needs contacts"):
             complete_object(bare, object=scene["object"], effectors=scene["effectors"], overrides=overrides)
 
+    def test_a_hinge_that_is_added_goes_to_where_its_target_is(self, lift_box):
+        motion, scene = lift_box
+        lid = HingeConfig("lid", "panel", [{"box": (0.1, 0.1, 0.01)}])
+        chest = replace(scene["object"], hinge=lid, fixed_base=True)
+        given = replace(motion, joint_target=motion.joint_pos + np.float32(0.1))
+        keyframes = Overrides(hinge={0: 0.0, 200: 0.5})
+        made = complete_object(given, object=chest, effectors=scene["effectors"], overrides=keyframes)
+        assert made.joint_names == (*motion.joint_names, "lid")
+        np.testing.assert_array_equal(made.joint_target[:, -1], made.joint_pos[:, -1])
+        np.testing.assert_array_equal(made.joint_target[:, :-1], given.joint_target)
+
     def test_hands_come_from_joints_in_any_order(self, lift_box):
         motion, scene = lift_box
         assert LEFT not in motion.body_names

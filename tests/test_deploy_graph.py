@@ -12,11 +12,11 @@ from mocks import load_config
 from omegaconf import DictConfig, open_dict
 from torch import Tensor
 
-from hdmi.assembly import Task, make_env, make_task
+from hdmi.assembly import Task, make_env, make_task, make_transforms
 from hdmi.config import task_files
 from hdmi.deploy.export import make_graph, metadata_of, to_onnx
 from hdmi.deploy.format import DeploymentError
-from hdmi.deploy.graph import PolicyGraph, name_of
+from hdmi.deploy.graph import PolicyGraph, forward_part, inverse_part, name_of
 from hdmi.envs import RowResetEnv
 from hdmi.functional import quat_apply_inverse
 from hdmi.learning.networks import make_actor, network_of
@@ -122,11 +122,11 @@ def test_graph_gives_the_trainers_targets(name: str, task_of):
 
 @pytest.mark.parametrize(
     "overrides",
-    [["task=walk"], ["task=push_door_hand"], ["task=lift_box", "+lever=[feedforward,root_history]"]],
+    [["task=walk", "+lever=[feedforward,root_history]"], ["task=push_door_hand"]],
     ids=" ".join,
 )
 def test_exported_graph_gives_the_trainers_targets(overrides: list[str], task_of):
-    """Robot alone, articulated, and with actions that start from what is computed of the reference."""
+    """Robot alone, with actions that start from what is computed of the reference, and articulated."""
     cfg = quiet(load_config(*overrides))
     task = task_of(cfg)
     env = make_env(cfg, 1, task)
@@ -153,12 +153,22 @@ class TestLiftBox:
         assert "tracking.bodies" not in nodes
 
     def test_aids_of_training_stay_behind(self, task_of):
-        cfg = load_config("+lever=[early_end,springs,springs_object,rewind,feedforward]")
-        task = task_of(cfg)
-        graph, _ = make_graph(cfg, untrained(make_env(cfg, 1, task)), task)
-        nodes = {name for name, _ in (*graph.stages, *graph.inverse)}
-        assert {"reference.motion", "reference.target", "action.target"} <= nodes
-        assert not [name for name in nodes if name.startswith(("assist", "early_end", "reset"))]
+        cfg = load_config("+lever=[early_end,springs,springs_object,rewind]")
+        stack = make_transforms(cfg, task_of(cfg))
+        nodes = {name for name, _ in stack}
+        assert {"assist.root", "assist.object", "early_end.early_root_pose", "reset.rewind"} <= nodes
+        kept = {name for name, _ in (*forward_part(stack, "policy"), *inverse_part(stack, "action"))}
+        assert {"reference.motion", "action.target", "input.policy"} <= kept
+        assert not [name for name in kept if name.startswith(("assist", "early_end", "reset"))]
+
+    def test_what_actions_start_from_comes_along(self, task_of, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.setattr("hdmi.assembly.reference_torque", lambda _, reference: reference.joint_pos.numpy())
+        cfg = load_config("+lever=feedforward")
+        stack = make_transforms(cfg, task_of(cfg))
+        without = [name for name, _ in forward_part(stack, "policy")]
+        along = [name for name, _ in forward_part(stack, "policy", ("ref", "joint_target"))]
+        assert set(along) - set(without) == {"reference.target"}
+        assert along.index("reference.motion") < along.index("reference.target")
 
     def test_state_is_what_the_next_tick_reads(self, parts):
         _, graph, _ = parts

@@ -217,7 +217,9 @@ def test_tasks_pass(name: str, monkeypatch: pytest.MonkeyPatch):
 def test_springs_pull_no_object_that_cannot_move(name: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("hdmi.assembly.start_tables", lambda *_: None)
     cfg = load_config(f"task={name}", "+lever=springs_object")
-    with pytest.raises(ConfigError, match=rf"assist\.object: .*motion '{name}' has no object that can be pulled"):
+    with pytest.raises(
+        ConfigError, match=rf"^assist\.object \(SpringAssist\): .*motion '{name}' has no object that can be pulled"
+    ):
         make_transforms(cfg, make_task(cfg))
 
 

@@ -106,8 +106,7 @@ class TestContinuation:
             ["seed=3"],
             pytest.param(["seed=1", "+ablation=no_randomization"], marks=pytest.mark.slow),
             ["seed=2", "+ablation=no_interaction_reward_no_contact_termination"],
-            ["reset=adaptive", "seed=5"],
-            ["+lever=[springs,springs_object,rewind]", "seed=4"],
+            ["reset=adaptive", "+lever=[springs,springs_object,rewind]", "seed=5"],
         ],
         ids=lambda overrides: overrides[-1],
     )

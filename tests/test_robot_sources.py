@@ -255,6 +255,19 @@ class TestUnits:
         taken = read_mjlab(tmp_path / "b.npz", given=Conventions(unit=0.01))
         np.testing.assert_allclose(taken.body_pos_w, motion.body_pos_w, atol=1e-5)
 
+    def test_joint_targets_are_angles_and_what_cannot_hold_them_says_so(self, tmp_path: Path) -> None:
+        motion = replace(walking(), joint_target=angles() + np.float32(0.1))
+        degrees = {key: np.rad2deg(getattr(motion, key)) for key in ("joint_pos", "joint_vel", "joint_target")}
+        save_motion(replace(motion, **degrees), tmp_path / "degrees")
+        taken, _, lost = convert(
+            tmp_path / "degrees", tmp_path / "hdmi", "hdmi", options=Options(given=Conventions(angles="degrees"))
+        )
+        np.testing.assert_allclose(taken.joint_target, motion.joint_target, atol=1e-5)
+        np.testing.assert_allclose(load_motion(tmp_path / "hdmi").joint_target, motion.joint_target, atol=1e-5)
+        assert not lost
+        _, _, lost = convert(tmp_path / "hdmi", tmp_path / "a.npz", "mjlab")
+        assert "joint_target" in lost
+
     @pytest.mark.parametrize(
         ("option", "value"),
         [("quat", "zyx"), ("angles", "turns"), ("up", "w"), ("ground", "yes"), ("unit", 0.0), ("unit", float("nan"))],

@@ -248,7 +248,7 @@ class TestRewind:
     def test_nothing_to_do_in_the_first_reset(self):
         assert T.Rewind()._reset_env_preprocess(None) is None
         empty = TensorDict({}, batch_size=[3])
-        assert "init" not in T.Rewind()._reset_env_preprocess(empty).keys()
+        assert T.Rewind()._reset_env_preprocess(empty).is_empty()
 
     @pytest.mark.parametrize("steps", [(-1, 5), (9, 5)])
     def test_bad_steps(self, steps):
@@ -458,6 +458,12 @@ class TestSpringAssist:
         assert not spring.inv(away)["wrench", "root"].any()
         spring.steps.fill_(1)
         close(spring.strength, 0.75)
+
+    def test_of_a_training_of_no_step_lasts_one(self, reference):
+        spring = T.SpringAssist(reference, robot_mass=1.0, total_steps=0)
+        close(spring.strength, 1.0)
+        spring.steps += 1
+        close(spring.strength, 0.0)
 
     @pytest.mark.parametrize("body", ["root", "object"])
     def test_pulls_to_the_reference(self, reference, body):

@@ -22,6 +22,7 @@ from hdmi.envs.warp_backend import WarpBackend  # noqa: E402
 
 pytestmark = pytest.mark.xdist_group("warp")  # one process compiles the kernels, not each
 N, SUBSTEPS = 4, 4
+WRENCHES = {"root": [10.0, -5.0, 20.0, 0.5, 1.0, -0.5], "object": [0.5, 0.2, 1.0, 0.0, 0.005, -0.005]}  # N, N m
 # After one control step from the same state.
 TOLERANCES = {"qpos": 2e-5, "qvel": 2e-3, "sensordata": 0.5, "actuator_force": 0.1, "xpos": 2e-5, "xquat": 2e-5}
 
@@ -138,6 +139,9 @@ def test_parity(name: str):
         action = joints.unsqueeze(1) + 0.2 * torch.randn(N, SUBSTEPS, 29, generator=generator)
         push = torch.randn(N, 6, generator=generator) * torch.tensor([0.0, 0.0, 0.3, 0.3]).unsqueeze(-1)
         inputs = TensorDict({"action": action, "push": push}, batch_size=[N])
+        for body, wrench in WRENCHES.items() if step == 1 else ():
+            if body == "root" or scene.object_free_dof is not None:
+                inputs["wrench", body] = torch.tensor(wrench).expand(N, 6)
         wanted, got = (env._step(inputs.clone()) for env in both)
         assert_near(warp, mujoco, f"step {step}")
         assert set(got.keys(True, True)) == set(wanted.keys(True, True))

@@ -86,7 +86,7 @@ class SpringAssist(SpecTransform):
         self.state_keys = [self.step_key, *(key_of(key) for key in (keys if state_keys is None else state_keys))]
         self.out_key = below("wrench", body) if out_key is None else key_of(out_key)
         self.robot_mass, self.radius, self.rate = robot_mass, radius, 2 * math.pi * frequency
-        self.max_acceleration, self.fade_steps = max_acceleration, fade * total_steps
+        self.max_acceleration, self.fade_steps = max_acceleration, max(fade * total_steps, 1.0)
         self.last = reference.num_frames - 1
         self.register_buffer("table", torch.cat(parts, dim=-1), persistent=False)  # [T, 13]
         self.register_buffer("steps", torch.zeros(()))
