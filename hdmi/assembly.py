@@ -255,7 +255,7 @@ def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
         "servo_damping": robot.damping,
         "reference": task.reference,
         "starts": task.starts,
-        "total_steps": cfg.total_frames // cfg.num_envs,
+        "total_steps": cfg.total_frames // (cfg.num_envs * _ranks()),
         "joint_torque": lambda: task.joint_torque,  # a second of work that only some stacks need
         "model": task.scene.model,
         "robot_bodies": task.scene.body_ids.tolist(),
@@ -276,6 +276,11 @@ def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
         written[entry] = keys
     check_order(stack)
     return stack
+
+
+def _ranks() -> int:
+    """Processes that train together: frames are counted over all of them."""
+    return torch.distributed.get_world_size() if torch.distributed.is_initialized() else 1
 
 
 def _nodes(cfg: DictConfig, entry: str) -> Iterator[tuple[str, Any]]:
