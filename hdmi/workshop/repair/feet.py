@@ -1,0 +1,71 @@
+"""Feet that stand where they touch down: planted phases of a robot's motion, and paths of the feet through them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, label
+from scipy.spatial.transform import Rotation
+
+from hdmi.assets import g1
+from hdmi.motion.playback import Playback
+from hdmi.workshop.repair.ground import support_height
+from hdmi.workshop.retarget.body import HEEL, TOE
+from hdmi.workshop.retarget.feet import carried_over, keeps_still, lasting
+
+_NEAR = 0.06  # m; toes or heel of a planted foot are no further from the ground
+_LEVEL = 0.35  # rad; a planted foot that leans less is meant to be flat
+_SPEED = 0.4  # m/s; of toes and heel of a planted foot, at most
+_RAMP = 0.06  # s, over which a foot rolls onto or off its toes
+
+
+@dataclass(frozen=True)
+class FootPath:
+    """Where a foot's body should be, and when it stands."""
+
+    pos: np.ndarray  # [T, 3] m
+    rotation: Rotation  # [T]
+    planted: np.ndarray  # bool [T]; at least the toes
+    flat: np.ndarray  # bool [T]; the whole sole
+
+    @property
+    def toe(self) -> np.ndarray:
+        """Where the front of the sole should be. [T, 3]"""
+        return self.pos + self.rotation.apply(TOE)
+
+
+def foot_path(playback: Playback, foot: str, away: np.ndarray) -> FootPath:
+    """The path of a foot whose planted phases have one place each, and one level pose where the sole is flat.
+
+    A foot is planted while it hardly moves near the ground. In a planted phase the toes keep the place and heading that
+    they have on average, on the ground, and the foot rolls about them. What that changes is carried over into the
+    swings before and after.
+
+    Args:
+        away: frames in which the foot is not to stand, whatever it does. bool [T]
+    """
+    pos, mat = playback.body_poses(foot)
+    rotation, fps = Rotation.from_matrix(mat), playback.fps
+    ends = pos[:, None] + np.stack([rotation.apply(TOE), rotation.apply(HEEL)], axis=1)  # [T, 2, 3]
+    ground = support_height(playback, ends) + g1.FOOT_POINT_RADIUS
+    near = (np.abs(ends[..., 2] - ground) < _NEAR) & ~away[:, None]
+    toe, heel = (lasting(keeps_still(ends[:, i], fps, _SPEED) & near[:, i], fps) for i in range(2))
+    flat = lasting(toe & heel & (np.arccos(np.clip(mat[:, 2, 2], -1.0, 1.0)) < _LEVEL), fps)
+    planted = toe | flat
+    heading = np.unwrap(np.arctan2(mat[:, 1, 0], mat[:, 0, 0]))
+    fixed_pos, turn = pos.copy(), np.zeros_like(pos)
+    stances, count = label(planted)
+    for stance in range(1, count + 1):
+        frames = stances == stance
+        level = frames & flat
+        if level.any():
+            upright = Rotation.from_euler("z", heading[level].mean())
+            share = np.minimum(distance_transform_edt(~level)[frames] / (_RAMP * fps), 1.0)
+            share = 1 - share**2 * (3 - 2 * share)
+            turn[frames] = share[:, None] * (upright * rotation[frames].inv()).as_rotvec()
+        at = level if level.any() else frames
+        pivot = np.append(ends[at, 0, :2].mean(axis=0), np.median(ground[at, 0]))
+        fixed_pos[frames] = pivot - (Rotation.from_rotvec(turn[frames]) * rotation[frames]).apply(TOE)
+    moved = carried_over(np.column_stack([fixed_pos - pos, turn]), planted)
+    return FootPath(pos + moved[:, :3], Rotation.from_rotvec(moved[:, 3:]) * rotation, planted, flat)

@@ -1,0 +1,65 @@
+"""End effectors on their contact points while contact is labelled, and eased there and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hdmi.assets import ObjectConfig
+from hdmi.assets.surface import object_surfaces
+from hdmi.motion.kinematics import minimum_jerk
+from hdmi.motion.playback import Playback
+from hdmi.workshop.annotate import intervals
+
+_EASE = 0.25  # s, over which an effector comes to its contact point, or longer,
+_PACE = 0.5  # m/s, where it would be faster than this
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Where an effector's point should be, and how far that counts, from 0 (free) to 1 (in contact)."""
+
+    pos: np.ndarray  # [T, 3] m
+    share: np.ndarray  # [T]
+
+
+def reaches(
+    playback: Playback, object: ObjectConfig, press: float, tolerance: float = 0.0, reduce: str = "mean"
+) -> list[Reach]:
+    """The effectors' paths to and on their contact points, in the order of the scene's. [E]
+
+    Args:
+        press: how far inside the surface the contact points are taken to be, besides what the effectors ask for, m.
+        tolerance: distance from a contact point that needs no mending, m.
+        reduce: `max`: of several effectors that are to touch, only the nearest has to.
+    """
+    label = playback.reference.contact.numpy()
+    points = playback.reference.contact_point.numpy().astype(float)  # [T, E, 3]
+    surface = object_surfaces(object)[object.link]
+    inward = surface.inward(points.reshape(-1, 3)).reshape(points.shape)
+    pos, mat = playback.body_poses(playback.scene.object_link)
+    goals = pos[:, None] + np.einsum("tij,tej->tei", mat, points + press * inward)
+    actual = playback.effector_pos_w
+    apart = np.linalg.norm(actual - goals, axis=-1)
+    if reduce == "max":
+        label = label & (apart == np.where(label, apart, np.inf).min(axis=1, keepdims=True))
+    if tolerance > 0:
+        near = np.minimum(tolerance / np.maximum(apart, 1e-9), 1.0)
+        goals = goals + near[..., None] * (actual - goals)
+        label = label & (apart > tolerance)
+    out = []
+    for e in range(label.shape[1]):
+        share = _eased(label[:, e], apart[:, e], playback.fps)
+        out.append(Reach(actual[:, e] + share[:, None] * (goals[:, e] - actual[:, e]), share))
+    return out
+
+
+def _eased(label: np.ndarray, apart: np.ndarray, fps: float) -> np.ndarray:
+    """A label with soft edges outside of it, the longer the further the effector has to come. [T] in 0..1"""
+    share, frames = np.zeros(len(label)), np.arange(len(label))
+    for first, last in intervals(label):
+        begin, end = (fps * max(_EASE, float(apart[t]) / _PACE) for t in (first, last))
+        away = np.maximum((first - frames) / begin, (frames - last) / end).clip(min=0.0)
+        share = np.maximum(share, minimum_jerk(1.0 - away))
+    return share

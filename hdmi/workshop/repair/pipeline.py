@@ -1,0 +1,248 @@
+"""From a reference with faults of its geometry to one near it without them.
+
+1. The object is put on its support wherever it rests (`rest`), the robot as a whole moved until it touches the ground
+   (`ground`).
+2. Feet get one place for each of their planted phases (`feet`), end effectors their contact points while contact is
+   labelled (`hands`).
+3. Inverse kinematics finds the joints, within ranges and speeds, and without entering floor, scenery or object;
+   everything that this leaves open is as in the reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig, g1, g1_robot
+from hdmi.config import ConfigError
+from hdmi.motion.check import MotionError
+from hdmi.motion.format import Motion, motion_from_poses
+from hdmi.motion.kinematics import forward_kinematics
+from hdmi.motion.playback import Playback, make_playback
+from hdmi.workshop import ik
+from hdmi.workshop.human import ObjectTrajectory
+from hdmi.workshop.repair.feet import FootPath, foot_path
+from hdmi.workshop.repair.ground import lowering
+from hdmi.workshop.repair.hands import Reach, reaches
+from hdmi.workshop.repair.rest import Poses, settled_object
+from hdmi.workshop.retarget.body import TOE
+from hdmi.workshop.retarget.object import obstacles
+
+# Weights per m and per rad: what touches the world counts most, then where the trunk is, then the reference's joints.
+_REACH = 60.0
+_PELVIS, _PELVIS_TURN, _TORSO_TURN = 10.0, 5.0, 3.0
+_SWING, _SWING_TURN = 30.0, 8.0
+_POSTURE = 1.0
+_SMOOTHING = 0.5
+_RIGID = 1e-3  # m; a body whose place in the frame of one of the robot's varies less moves with it
+
+
+@dataclass(frozen=True)
+class Repair:
+    """A repaired motion, and what inverse kinematics could not do.
+
+    Examples:
+        >>> from hdmi.motion import find_motion, load_motion
+        >>> walk = load_motion(find_motion("walk"))
+        >>> short = replace(walk, **{key: value[:5] for key, value in vars(walk).items() if np.ndim(value) > 1})
+        >>> repaired = repair_motion(short)
+        >>> repaired.motion.num_frames, repaired.failures
+        (5, 0)
+    """
+
+    motion: Motion
+    planted: dict[str, float]  # share of the frames in which each foot stands
+    misses: dict[str, float]  # furthest that planted feet and labelled effectors are from where they should be, m
+    failures: int  # frames without a solution
+
+
+def repair_motion(
+    motion: Motion,
+    *,
+    robot: RobotConfig | None = None,
+    object: ObjectConfig | None = None,
+    scenery: Sequence[SceneryConfig] = (),
+    effectors: Sequence[Effector] = (),
+    press: float = 0.01,
+    tolerance: float = 0.0,
+    reduce: str = "mean",
+    on_frame: Callable[[int], None] | None = None,
+) -> Repair:
+    """Mends floating and sliding feet, effectors that miss their contact points, and an object off its support.
+
+    Names, rate, labels and contact points stay; velocities are those of the new poses. Joints that the robot of the
+    task holds, or that the motion lacks, are at its default pose.
+
+    Args:
+        press: how deep effectors are in the object while contact is labelled, m.
+        tolerance, reduce: of the task's interaction reward, as for `hdmi.workshop.validate.validate_motion`.
+        on_frame: called with the index of every solved frame.
+
+    Raises:
+        ImportError: without the extra `retarget`.
+        MotionError: if motion and task do not fit together.
+        ConfigError: for another robot than the G1.
+    """
+    robot = robot or RobotConfig()
+    if robot.model != g1_robot():
+        raise ConfigError(f"robot.model: motions are repaired for the G1, not for {robot.model.name}")
+    if effectors and motion.object_contact is None:
+        raise MotionError(f"motion {motion.name!r}: has no object_contact labels; annotate it first")
+    absent = [name for name in g1.JOINT_NAMES if name not in motion.joint_names]
+    robot = replace(robot, feet="sphere", held=[*robot.held_joints, *absent])
+    playback = make_playback(motion, robot=robot, object=object, scenery=scenery, effectors=effectors)
+    thing = settled_object(playback) if object is not None else None
+    playback = _placed(playback, thing)
+    playback = _placed(playback, thing, lowering(playback))
+    feet = {foot: foot_path(playback, foot, _pushing(playback, foot)) for foot in g1.FEET}
+    hands = reaches(playback, object, press, tolerance, reduce) if object is not None and effectors else []
+    start = playback.qpos[0, : 7 + len(g1.JOINT_NAMES)].copy()
+    start[7:] = playback.qpos[0, playback.scene.joint_qpos]
+    result = ik.solve(
+        _targets(playback, feet, hands),
+        motion.num_frames,
+        motion.fps,
+        initial=start,
+        obstacles=_obstacles(playback, object, thing, scenery, hands, press),
+        options=ik.IkOptions(floor=0.0, limit_margin=0.0, smoothing=_SMOOTHING, self_collision=0.0),
+        robot=robot,
+        on_frame=on_frame,
+    )
+    misses = {
+        name: float(np.nanmax(values))
+        for name, values in result.residuals.items()
+        if name.endswith(("toes planted", "on its contact point")) and np.isfinite(values).any()
+    }
+    planted = {foot: float(path.planted.mean()) for foot, path in feet.items()}
+    return Repair(_repaired(motion, object, thing, robot, result), planted, misses, len(result.failures))
+
+
+def _placed(playback: Playback, thing: Poses | None, up: np.ndarray | float = 0.0) -> Playback:
+    """The playback with its object elsewhere, and the robot moved up. [T, 3], [T, 4]; [T] m"""
+    qpos, q = playback.qpos.copy(), playback.scene.object_free_qpos
+    qpos[:, 2] += up
+    if thing is not None and q is not None:
+        qpos[:, q : q + 3], qpos[:, q + 3 : q + 7] = thing
+    return replace(playback, qpos=qpos)
+
+
+def _pushing(playback: Playback, body: str) -> np.ndarray:
+    """Frames in which a body is to touch the object. bool [T]"""
+    columns = [e for e, effector in enumerate(playback.scene.effectors) if effector.body == body]
+    pushing: np.ndarray = playback.reference.contact.numpy()[:, columns].any(axis=1)
+    return pushing
+
+
+def _targets(playback: Playback, feet: dict[str, FootPath], hands: Sequence[Reach]) -> list[ik.Target]:
+    def turned(body: str) -> np.ndarray:
+        return Rotation.from_matrix(playback.body_poses(body)[1]).as_quat(scalar_first=True)
+
+    targets: list[ik.Target] = [
+        ik.PointTarget("pelvis", playback.qpos[:, :3], _PELVIS),
+        ik.OrientationTarget("pelvis", turned("pelvis"), _PELVIS_TURN),
+        ik.OrientationTarget("torso_link", turned("torso_link"), _TORSO_TURN),
+        ik.PostureTarget(playback.qpos[:, playback.scene.joint_qpos], _POSTURE),
+    ]
+    effectors = playback.scene.effectors
+    pairs = list(zip(effectors, hands, strict=True)) if hands else []
+    for foot, path in feet.items():
+        free = 1 - np.max([hand.share for effector, hand in pairs if effector.body == foot] or [[0.0]], axis=0)
+        toe = path.planted[:, None]
+        targets += [
+            ik.PointTarget(foot, path.toe, toe * ik.PLANTED_WEIGHT[0], TOE, f"{foot} toes planted"),
+            ik.PointTarget(foot, path.pos, ~toe * _SWING * free[:, None], name=f"{foot} in swing"),
+            ik.OrientationTarget(
+                foot,
+                path.rotation.as_quat(scalar_first=True),
+                np.where(path.flat[:, None], ik.PLANTED_WEIGHT[1], np.where(toe, 2, 1) * _SWING_TURN * free[:, None]),
+            ),
+        ]
+    for effector, hand in pairs:
+        name = f"{effector.body} on its contact point"
+        targets.append(ik.PointTarget(effector.body, hand.pos, _REACH * hand.share[:, None], effector.point, name))
+    return targets
+
+
+def _obstacles(
+    playback: Playback,
+    object: ObjectConfig | None,
+    thing: Poses | None,
+    scenery: Sequence[SceneryConfig],
+    hands: Sequence[Reach],
+    press: float,
+) -> list[ik.Obstacle]:
+    """The object, into which effectors may be pressed, and the scenery."""
+    out = []
+    for item in scenery:
+        pos, quat = playback.reference.placements.get(item.name, (item.pos, item.quat))
+        assert pos is not None
+        out.append(ik.Obstacle(item.name, item.geoms, pos, quat))
+    if object is not None and thing is not None:
+        angle = playback.reference.object_joint_pos.numpy()
+        trajectory = ObjectTrajectory(object.name, *thing, angle[:, 0] if angle.shape[1] else None)
+        pairs = zip(playback.scene.effectors, hands, strict=False)
+        yields = {effector.body: press * hand.share for effector, hand in pairs}
+        out += [replace(obstacle, yields=yields) for obstacle in obstacles(object, trajectory)]
+    return out
+
+
+def _repaired(
+    motion: Motion, object: ObjectConfig | None, thing: Poses | None, robot: RobotConfig, result: ik.IkResult
+) -> Motion:
+    """The motion with the new poses of the robot, of bodies that are rigid with it, and of the object."""
+    new_pos, new_quat = forward_kinematics(robot.model, result.root_pos, result.root_quat, result.joint_pos)
+    pos, quat = motion.body_pos_w.astype(float), motion.body_quat_w.astype(float)
+    carriers = _carriers(motion)
+    for i, name in enumerate(motion.body_names):
+        if name in g1.BODY_NAMES:
+            b = g1.BODY_NAMES.index(name)
+            pos[:, i], quat[:, i] = new_pos[:, b], new_quat[:, b]
+        elif object is not None and thing is not None and name == object.name:
+            pos[:, i], quat[:, i] = thing
+        elif name in carriers:
+            column = motion.body_names.index(carriers[name])
+            before = Rotation.from_quat(motion.body_quat_w[:, column], scalar_first=True)
+            b = g1.BODY_NAMES.index(carriers[name])
+            turn = Rotation.from_quat(new_quat[:, b], scalar_first=True) * before.inv()
+            pos[:, i] = new_pos[:, b] + turn.apply(motion.body_pos_w[:, i] - motion.body_pos_w[:, column])
+            quat[:, i] = (turn * Rotation.from_quat(quat[:, i], scalar_first=True)).as_quat(scalar_first=True)
+    joint_pos = motion.joint_pos.astype(float)
+    for i, name in enumerate(motion.joint_names):
+        if name in g1.JOINT_NAMES:
+            joint_pos[:, i] = result.joint_pos[:, g1.JOINT_NAMES.index(name)]
+    repaired = motion_from_poses(
+        motion.name,
+        motion.fps,
+        motion.body_names,
+        motion.joint_names,
+        pos,
+        quat,
+        joint_pos,
+        motion.object_contact,
+        motion.contact_points,
+    )
+    if motion.joint_target is None:
+        return repaired
+    target = motion.joint_target + repaired.joint_pos - motion.joint_pos
+    return replace(repaired, joint_target=target.astype(np.float32))
+
+
+def _carriers(motion: Motion) -> dict[str, str]:
+    """The robot's body that each of the other bodies that move rigidly with one moves with."""
+    robot = [name for name in motion.body_names if name in g1.BODY_NAMES]
+    columns = [motion.body_names.index(name) for name in robot]
+    out = {}
+    for i, name in enumerate(motion.body_names):
+        if name in robot or np.ptp(motion.body_pos_w[:, i], axis=0).max() < _RIGID:
+            continue
+        spread = []
+        for column in columns:
+            inverse = Rotation.from_quat(motion.body_quat_w[:, column], scalar_first=True).inv()
+            local = inverse.apply(motion.body_pos_w[:, i] - motion.body_pos_w[:, column])
+            spread.append(np.ptp(local, axis=0).max())
+        if min(spread) < _RIGID:
+            out[name] = robot[int(np.argmin(spread))]
+    return out
