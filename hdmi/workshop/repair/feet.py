@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, label
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d, label
 from scipy.spatial.transform import Rotation
 
 from hdmi.assets import g1
@@ -16,8 +16,11 @@ from hdmi.workshop.retarget.feet import carried_over, keeps_still, lasting
 
 _NEAR = 0.06  # m; toes or heel of a planted foot are no further from the ground
 _LEVEL = 0.35  # rad; a planted foot that leans less is meant to be flat
-_SPEED = 0.4  # m/s; of toes and heel of a planted foot, at most
+_SPEED = 0.3  # m/s; of toes and heel of a planted foot, at most
 _RAMP = 0.06  # s, over which a foot rolls onto or off its toes
+_EASE = 0.02  # s; standard deviation over which corrections of the path are smoothed
+_CLEAR = 0.02  # m; a foot that swings is at least that far above the ground,
+_TAKE_OFF = 0.1  # s after it has left it
 
 
 @dataclass(frozen=True)
@@ -68,4 +71,21 @@ def foot_path(playback: Playback, foot: str, away: np.ndarray) -> FootPath:
         pivot = np.append(ends[at, 0, :2].mean(axis=0), np.median(ground[at, 0]))
         fixed_pos[frames] = pivot - (Rotation.from_rotvec(turn[frames]) * rotation[frames]).apply(TOE)
     moved = carried_over(np.column_stack([fixed_pos - pos, turn]), planted)
-    return FootPath(pos + moved[:, :3], Rotation.from_rotvec(moved[:, 3:]) * rotation, planted, flat)
+    moved = gaussian_filter1d(moved, _EASE * fps, axis=0, mode="nearest")  # a foot does not stop at once
+    pos, rotation = pos + moved[:, :3], Rotation.from_rotvec(moved[:, 3:]) * rotation
+    pos[:, 2] += _lift(playback, pos, rotation, planted)
+    return FootPath(pos, rotation, planted, flat)
+
+
+def _lift(playback: Playback, pos: np.ndarray, rotation: Rotation, planted: np.ndarray) -> np.ndarray:
+    """How far a foot has to be raised so as not to drag where it swings low over the ground, m. [T]"""
+    if not planted.any():
+        return np.zeros(len(pos))
+    ends = pos[:, None] + np.stack([rotation.apply(TOE), rotation.apply(HEEL)], axis=1)
+    height = (ends[..., 2] - support_height(playback, ends)).min(axis=1) - g1.FOOT_POINT_RADIUS
+    away = np.minimum(distance_transform_edt(~planted) / (_TAKE_OFF * playback.fps), 1.0)
+    low = (height < _CLEAR) & (height > -_NEAR)
+    raised: np.ndarray = gaussian_filter1d(
+        np.where(low, away**2 * (3 - 2 * away) * (_CLEAR - height), 0.0), _EASE * playback.fps
+    )
+    return np.where(planted, 0.0, raised)

@@ -14,13 +14,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from hdmi.assets import Effector, ObjectConfig, RobotConfig, SceneryConfig, g1, g1_robot
 from hdmi.config import ConfigError
 from hdmi.motion.check import MotionError
 from hdmi.motion.format import Motion, motion_from_poses
-from hdmi.motion.kinematics import forward_kinematics
+from hdmi.motion.kinematics import forward_kinematics, minimum_jerk
 from hdmi.motion.playback import Playback, make_playback
 from hdmi.workshop import ik
 from hdmi.workshop.human import ObjectTrajectory
@@ -37,6 +38,10 @@ _PELVIS, _PELVIS_TURN, _TORSO_TURN = 10.0, 5.0, 3.0
 _SWING, _SWING_TURN = 30.0, 8.0
 _POSTURE = 1.0
 _SMOOTHING = 0.5
+_PASSES = 2  # of inverse kinematics; each later one follows what the one before made, smoothed
+_FOLLOW = 5.0  # how much more its path counts than the reference's
+_SPREAD = 0.06  # s; standard deviation over which corrections are smoothed
+_RAMP = 0.08  # s, over which a foot takes hold of the ground
 _RIGID = 1e-3  # m; a body whose place in the frame of one of the robot's varies less moves with it
 
 
@@ -99,23 +104,24 @@ def repair_motion(
     playback = _placed(playback, thing, lowering(playback))
     feet = {foot: foot_path(playback, foot, _pushing(playback, foot)) for foot in g1.FEET}
     hands = reaches(playback, object, press, tolerance, reduce) if object is not None and effectors else []
-    start = playback.qpos[0, : 7 + len(g1.JOINT_NAMES)].copy()
-    start[7:] = playback.qpos[0, playback.scene.joint_qpos]
-    result = ik.solve(
-        _targets(playback, feet, hands),
-        motion.num_frames,
-        motion.fps,
-        initial=start,
-        obstacles=_obstacles(playback, object, thing, scenery, hands, press),
-        options=ik.IkOptions(floor=0.0, limit_margin=0.0, smoothing=_SMOOTHING, self_collision=0.0),
-        robot=robot,
-        on_frame=on_frame,
-    )
-    misses = {
-        name: float(np.nanmax(values))
-        for name, values in result.residuals.items()
-        if name.endswith(("toes planted", "on its contact point")) and np.isfinite(values).any()
-    }
+    touching = _touching(playback, feet, hands)
+    reference = np.column_stack([playback.qpos[:, :7], playback.qpos[:, playback.scene.joint_qpos]])
+    qpos, weight = reference, 1.0
+    for _ in range(_PASSES):
+        result = ik.solve(
+            [*_near(qpos, weight), *touching],
+            motion.num_frames,
+            motion.fps,
+            initial=qpos[0],
+            obstacles=_obstacles(playback, object, thing, scenery, hands, press),
+            options=ik.IkOptions(floor=0.0, limit_margin=0.0, smoothing=_SMOOTHING, self_collision=0.0),
+            robot=robot,
+            on_frame=on_frame,
+        )
+        qpos, weight = _smoothed(result.qpos, reference, motion.fps), _FOLLOW
+    wanted = {foot: path.planted for foot, path in feet.items()}
+    wanted |= {_on_point(effector): hand.share == 1 for effector, hand in zip(effectors, hands, strict=False)}
+    misses = {name: float(result.residuals[name][when].max()) for name, when in wanted.items() if when.any()}
     planted = {foot: float(path.planted.mean()) for foot, path in feet.items()}
     return Repair(_repaired(motion, object, thing, robot, result), planted, misses, len(result.failures))
 
@@ -136,34 +142,55 @@ def _pushing(playback: Playback, body: str) -> np.ndarray:
     return pushing
 
 
-def _targets(playback: Playback, feet: dict[str, FootPath], hands: Sequence[Reach]) -> list[ik.Target]:
-    def turned(body: str) -> np.ndarray:
-        return Rotation.from_matrix(playback.body_poses(body)[1]).as_quat(scalar_first=True)
-
-    targets: list[ik.Target] = [
-        ik.PointTarget("pelvis", playback.qpos[:, :3], _PELVIS),
-        ik.OrientationTarget("pelvis", turned("pelvis"), _PELVIS_TURN),
-        ik.OrientationTarget("torso_link", turned("torso_link"), _TORSO_TURN),
-        ik.PostureTarget(playback.qpos[:, playback.scene.joint_qpos], _POSTURE),
+def _near(qpos: np.ndarray, weight: float) -> list[ik.Target]:
+    """Targets near a path of the robot. [T, 36]"""
+    _, quat = forward_kinematics(g1_robot(), qpos[:, :3], qpos[:, 3:7], qpos[:, 7:])
+    return [
+        ik.PointTarget("pelvis", qpos[:, :3], weight * _PELVIS),
+        ik.OrientationTarget("pelvis", qpos[:, 3:7], weight * _PELVIS_TURN),
+        ik.OrientationTarget("torso_link", quat[:, g1.BODY_NAMES.index("torso_link")], weight * _TORSO_TURN),
+        ik.PostureTarget(qpos[:, 7:], weight * _POSTURE),
     ]
+
+
+def _smoothed(qpos: np.ndarray, reference: np.ndarray, fps: float) -> np.ndarray:
+    """A path whose difference from the reference is smooth over time. [T, 36]"""
+    before = Rotation.from_quat(reference[:, 3:7], scalar_first=True)
+    turn = (Rotation.from_quat(qpos[:, 3:7], scalar_first=True) * before.inv()).as_rotvec()
+    change = np.column_stack([qpos[:, :3] - reference[:, :3], turn, qpos[:, 7:] - reference[:, 7:]])
+    change = gaussian_filter1d(change, _SPREAD * fps, axis=0, mode="nearest")
+    quat = (Rotation.from_rotvec(change[:, 3:6]) * before).as_quat(scalar_first=True)
+    return np.column_stack([reference[:, :3] + change[:, :3], quat, reference[:, 7:] + change[:, 6:]])
+
+
+def _touching(playback: Playback, feet: dict[str, FootPath], hands: Sequence[Reach]) -> list[ik.Target]:
+    """Targets of the feet and of the end effectors."""
+    targets: list[ik.Target] = []
     effectors = playback.scene.effectors
     pairs = list(zip(effectors, hands, strict=True)) if hands else []
     for foot, path in feet.items():
         free = 1 - np.max([hand.share for effector, hand in pairs if effector.body == foot] or [[0.0]], axis=0)
-        toe = path.planted[:, None]
+        place = free * _SWING + _ramped(path.planted, playback.fps) * (ik.PLANTED_WEIGHT[0] - free * _SWING)
+        turn = free * _SWING_TURN + _ramped(path.flat, playback.fps) * (ik.PLANTED_WEIGHT[1] - free * _SWING_TURN)
         targets += [
-            ik.PointTarget(foot, path.toe, toe * ik.PLANTED_WEIGHT[0], TOE, f"{foot} toes planted"),
-            ik.PointTarget(foot, path.pos, ~toe * _SWING * free[:, None], name=f"{foot} in swing"),
-            ik.OrientationTarget(
-                foot,
-                path.rotation.as_quat(scalar_first=True),
-                np.where(path.flat[:, None], ik.PLANTED_WEIGHT[1], np.where(toe, 2, 1) * _SWING_TURN * free[:, None]),
-            ),
+            ik.PointTarget(foot, path.toe, place[:, None], TOE),
+            ik.OrientationTarget(foot, path.rotation.as_quat(scalar_first=True), turn[:, None]),
         ]
     for effector, hand in pairs:
-        name = f"{effector.body} on its contact point"
-        targets.append(ik.PointTarget(effector.body, hand.pos, _REACH * hand.share[:, None], effector.point, name))
+        weight = _REACH * hand.share[:, None]
+        targets.append(ik.PointTarget(effector.body, hand.pos, weight, effector.point, _on_point(effector)))
     return targets
+
+
+def _on_point(effector: Effector) -> str:
+    return f"{effector.body} on its contact point"
+
+
+def _ramped(mask: np.ndarray, fps: float) -> np.ndarray:
+    """A mask with soft edges outside of it. [T] in 0..1"""
+    if not mask.any():
+        return np.zeros(len(mask))
+    return minimum_jerk(1 - distance_transform_edt(~mask) / (_RAMP * fps))
 
 
 def _obstacles(
