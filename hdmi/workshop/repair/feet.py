@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, gaussian_filter1d, label
+from scipy.ndimage import binary_closing, distance_transform_edt, gaussian_filter1d, label
 from scipy.spatial.transform import Rotation
 
 from hdmi.assets import g1
@@ -17,6 +17,7 @@ from hdmi.workshop.retarget.feet import carried_over, keeps_still, lasting
 _NEAR = 0.06  # m; toes or heel of a planted foot are no further from the ground
 _LEVEL = 0.35  # rad; a planted foot that leans less is meant to be flat
 _SPEED = 0.3  # m/s; of toes and heel of a planted foot, at most
+_PAUSE = 0.3  # s; a sole that is off the ground for less between being flat stays flat
 _RAMP = 0.06  # s, over which a foot rolls onto or off its toes
 _EASE = 0.02  # s; standard deviation over which corrections of the path are smoothed
 _CLEAR = 0.02  # m; a foot that swings is at least that far above the ground,
@@ -56,6 +57,7 @@ def foot_path(playback: Playback, foot: str, away: np.ndarray) -> FootPath:
     toe, heel = (lasting(keeps_still(ends[:, i], fps, _SPEED) & near[:, i], fps) for i in range(2))
     flat = lasting(toe & heel & (np.arccos(np.clip(mat[:, 2, 2], -1.0, 1.0)) < _LEVEL), fps)
     planted = toe | flat
+    flat = binary_closing(np.pad(flat, pause := round(_PAUSE * fps)), np.ones(pause + 1, bool))[pause:-pause] & planted
     heading = np.unwrap(np.arctan2(mat[:, 1, 0], mat[:, 0, 0]))
     fixed_pos, turn = pos.copy(), np.zeros_like(pos)
     stances, count = label(planted)

@@ -38,7 +38,7 @@ def support_height(playback: Playback, points: np.ndarray) -> np.ndarray:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         for p, point in enumerate(points[t]):
-            above = point + [0.0, 0.0, _STEP_UP]
+            above = point + np.array([0.0, 0.0, _STEP_UP])
             distance = mujoco.mj_ray(model, data, above, down, groups[bool(stands[t])], 1, -1, hit)
             if distance >= 0:
                 out[t, p] = above[2] - distance

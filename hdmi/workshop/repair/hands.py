@@ -48,18 +48,30 @@ def reaches(
         near = np.minimum(tolerance / np.maximum(apart, 1e-9), 1.0)
         goals = goals + near[..., None] * (actual - goals)
         label = label & (apart > tolerance)
+    local = np.einsum("tji,tej->tei", mat, goals - actual)
     out = []
     for e in range(label.shape[1]):
-        share = _eased(label[:, e], apart[:, e], playback.fps)
-        out.append(Reach(actual[:, e] + share[:, None] * (goals[:, e] - actual[:, e]), share))
+        change, share = _eased(label[:, e], local[:, e], playback.fps)
+        out.append(Reach(actual[:, e] + np.einsum("tij,tj->ti", mat, change), share))
     return out
 
 
-def _eased(label: np.ndarray, apart: np.ndarray, fps: float) -> np.ndarray:
-    """A label with soft edges outside of it, the longer the further the effector has to come. [T] in 0..1"""
-    share, frames = np.zeros(len(label)), np.arange(len(label))
+def _eased(label: np.ndarray, change: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
+    """Changes of a path where a label is on, eased in and out around it, the slower the larger they are.
+
+    Args:
+        label: bool [T]
+        change: in the frame of what is touched, m. [T, 3]
+
+    Returns:
+        Changes [T, 3], and how far the label counts, from 0 to 1. [T]
+    """
+    frames, total = np.arange(len(label)), np.zeros_like(change)
+    shares = np.zeros((1, len(label)))
     for first, last in intervals(label):
-        begin, end = (fps * max(_EASE, float(apart[t]) / _PACE) for t in (first, last))
+        begin, end = (fps * max(_EASE, float(np.linalg.norm(change[t])) / _PACE) for t in (first, last))
         away = np.maximum((first - frames) / begin, (frames - last) / end).clip(min=0.0)
-        share = np.maximum(share, minimum_jerk(1.0 - away))
-    return share
+        share = minimum_jerk(1.0 - away)
+        total += share[:, None] * change[np.clip(frames, first, last)]
+        shares = np.vstack([shares, share])
+    return total / np.maximum(shares.sum(axis=0), 1.0)[:, None], shares.max(axis=0)

@@ -12,7 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
+import mujoco
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 from scipy.spatial.transform import Rotation
@@ -34,13 +36,15 @@ from hdmi.workshop.retarget.object import obstacles
 
 # Weights per m and per rad: what touches the world counts most, then where the trunk is, then the reference's joints.
 _REACH = 60.0
-_PELVIS, _PELVIS_TURN, _TORSO_TURN = 10.0, 5.0, 3.0
+_PELVIS, _PELVIS_TURN, _TORSO_TURN = 10.0, 5.0, 10.0
 _SWING, _SWING_TURN = 30.0, 8.0
 _POSTURE = 1.0
+_BALANCE = 20.0
 _SMOOTHING = 0.5
 _PASSES = 2  # of inverse kinematics; each later one follows what the one before made, smoothed
 _FOLLOW = 5.0  # how much more its path counts than the reference's
 _SPREAD = 0.06  # s; standard deviation over which corrections are smoothed
+_JOLT = (20.0, 150.0)  # m/s^2 and rad/s^2; corrections of the root and of joints that change faster are smoothed again
 _RAMP = 0.08  # s, over which a foot takes hold of the ground
 _RIGID = 1e-3  # m; a body whose place in the frame of one of the robot's varies less moves with it
 
@@ -54,14 +58,13 @@ class Repair:
         >>> walk = load_motion(find_motion("walk"))
         >>> short = replace(walk, **{key: value[:5] for key, value in vars(walk).items() if np.ndim(value) > 1})
         >>> repaired = repair_motion(short)
-        >>> repaired.motion.num_frames, repaired.failures
-        (5, 0)
+        >>> repaired.motion.num_frames, repaired.unsolved
+        (5, [])
     """
 
     motion: Motion
     planted: dict[str, float]  # share of the frames in which each foot stands
-    misses: dict[str, float]  # furthest that planted feet and labelled effectors are from where they should be, m
-    failures: int  # frames without a solution
+    unsolved: list[int]  # frames without a solution: they have the pose of the one before
 
 
 def repair_motion(
@@ -74,7 +77,7 @@ def repair_motion(
     press: float = 0.01,
     tolerance: float = 0.0,
     reduce: str = "mean",
-    on_frame: Callable[[int], None] | None = None,
+    on_frame: Callable[[int, int], None] | None = None,
 ) -> Repair:
     """Mends floating and sliding feet, effectors that miss their contact points, and an object off its support.
 
@@ -84,7 +87,7 @@ def repair_motion(
     Args:
         press: how deep effectors are in the object while contact is labelled, m.
         tolerance, reduce: of the task's interaction reward, as for `hdmi.workshop.validate.validate_motion`.
-        on_frame: called with the index of every solved frame.
+        on_frame: called with how many of how many frames are solved, all passes together.
 
     Raises:
         ImportError: without the extra `retarget`.
@@ -106,24 +109,34 @@ def repair_motion(
     hands = reaches(playback, object, press, tolerance, reduce) if object is not None and effectors else []
     touching = _touching(playback, feet, hands)
     reference = np.column_stack([playback.qpos[:, :7], playback.qpos[:, playback.scene.joint_qpos]])
-    qpos, weight = reference, 1.0
-    for _ in range(_PASSES):
+    com = ik.ComTarget(_centre_of_mass(playback), (_BALANCE, _BALANCE, 0.0))
+    qpos, weight, unsolved = reference, 1.0, set[int]()
+    total = _PASSES * motion.num_frames
+    for first in range(0, total, motion.num_frames):
         result = ik.solve(
-            [*_near(qpos, weight), *touching],
+            [*_near(qpos, weight), com, *touching],
             motion.num_frames,
             motion.fps,
             initial=qpos[0],
             obstacles=_obstacles(playback, object, thing, scenery, hands, press),
             options=ik.IkOptions(floor=0.0, limit_margin=0.0, smoothing=_SMOOTHING, self_collision=0.0),
             robot=robot,
-            on_frame=on_frame,
+            on_frame=None if on_frame is None else partial(_tell, on_frame, first, total),
         )
-        qpos, weight = _smoothed(result.qpos, reference, motion.fps), _FOLLOW
-    wanted = {foot: path.planted for foot, path in feet.items()}
-    wanted |= {_on_point(effector): hand.share == 1 for effector, hand in zip(effectors, hands, strict=False)}
-    misses = {name: float(result.residuals[name][when].max()) for name, when in wanted.items() if when.any()}
+        change = _change(result.qpos, reference)
+        smooth = gaussian_filter1d(change, _SPREAD * motion.fps, axis=0, mode="nearest")
+        qpos, weight = _changed(reference, smooth), _FOLLOW
+        unsolved |= set(result.failures.tolist())
+    qpos = _changed(reference, _calmed(change, motion.fps))
+    qpos[:, 7:] = np.clip(qpos[:, 7:], *np.array(g1.JOINT_RANGES).T)
+    held = np.isin(g1.JOINT_NAMES, robot.held_joints)
+    qpos[:, 7:][:, held] = robot.default_joint_pos[held]
     planted = {foot: float(path.planted.mean()) for foot, path in feet.items()}
-    return Repair(_repaired(motion, object, thing, robot, result), planted, misses, len(result.failures))
+    return Repair(_repaired(motion, object, thing, robot, qpos), planted, sorted(unsolved))
+
+
+def _tell(on_frame: Callable[[int, int], None], first: int, total: int, frame: int) -> None:
+    on_frame(first + frame + 1, total)
 
 
 def _placed(playback: Playback, thing: Poses | None, up: np.ndarray | float = 0.0) -> Playback:
@@ -138,7 +151,7 @@ def _placed(playback: Playback, thing: Poses | None, up: np.ndarray | float = 0.
 def _pushing(playback: Playback, body: str) -> np.ndarray:
     """Frames in which a body is to touch the object. bool [T]"""
     columns = [e for e, effector in enumerate(playback.scene.effectors) if effector.body == body]
-    pushing: np.ndarray = playback.reference.contact.numpy()[:, columns].any(axis=1)
+    pushing: np.ndarray = playback.reference.contact.numpy()[:, columns].sum(axis=1) > 0
     return pushing
 
 
@@ -146,21 +159,47 @@ def _near(qpos: np.ndarray, weight: float) -> list[ik.Target]:
     """Targets near a path of the robot. [T, 36]"""
     _, quat = forward_kinematics(g1_robot(), qpos[:, :3], qpos[:, 3:7], qpos[:, 7:])
     return [
-        ik.PointTarget("pelvis", qpos[:, :3], weight * _PELVIS),
+        ik.PointTarget("pelvis", qpos[:, :3], weight * np.asarray(_PELVIS)),
         ik.OrientationTarget("pelvis", qpos[:, 3:7], weight * _PELVIS_TURN),
         ik.OrientationTarget("torso_link", quat[:, g1.BODY_NAMES.index("torso_link")], weight * _TORSO_TURN),
         ik.PostureTarget(qpos[:, 7:], weight * _POSTURE),
     ]
 
 
-def _smoothed(qpos: np.ndarray, reference: np.ndarray, fps: float) -> np.ndarray:
-    """A path whose difference from the reference is smooth over time. [T, 36]"""
-    before = Rotation.from_quat(reference[:, 3:7], scalar_first=True)
-    turn = (Rotation.from_quat(qpos[:, 3:7], scalar_first=True) * before.inv()).as_rotvec()
-    change = np.column_stack([qpos[:, :3] - reference[:, :3], turn, qpos[:, 7:] - reference[:, 7:]])
-    change = gaussian_filter1d(change, _SPREAD * fps, axis=0, mode="nearest")
-    quat = (Rotation.from_rotvec(change[:, 3:6]) * before).as_quat(scalar_first=True)
-    return np.column_stack([reference[:, :3] + change[:, :3], quat, reference[:, 7:] + change[:, 6:]])
+def _centre_of_mass(playback: Playback) -> np.ndarray:
+    """The robot's, m. [T, 3]"""
+    model, out = playback.scene.model, np.empty((playback.num_frames, 3))
+    for t, data in enumerate(playback.frames()):
+        mujoco.mj_comPos(model, data)
+        out[t] = data.subtree_com[model.body(g1.BODY_NAMES[0]).id]
+    return out
+
+
+def _change(qpos: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """What a path of the robot differs from the reference by: place, rotation vector and joints. [T, 36] -> [T, 35]"""
+    before, after = (Rotation.from_quat(path[:, 3:7], scalar_first=True) for path in (reference, qpos))
+    turn = (after * before.inv()).as_rotvec()
+    return np.column_stack([qpos[:, :3] - reference[:, :3], turn, qpos[:, 7:] - reference[:, 7:]])
+
+
+def _changed(reference: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """The inverse of `_change`."""
+    turned = Rotation.from_rotvec(change[:, 3:6]) * Rotation.from_quat(reference[:, 3:7], scalar_first=True)
+    place, joints = reference[:, :3] + change[:, :3], reference[:, 7:] + change[:, 6:]
+    return np.column_stack([place, turned.as_quat(scalar_first=True), joints])
+
+
+def _calmed(change: np.ndarray, fps: float) -> np.ndarray:
+    """The change without jolts, where a contact stops the robot within a frame: smoothed around them. [T, 35]"""
+    limit = np.repeat([_JOLT[0], _JOLT[1]], [3, change.shape[1] - 3])
+    for _ in range(_PASSES):
+        jolts = (np.abs(np.diff(change, 2, axis=0)) * fps**2 > limit).any(axis=1)
+        if not jolts.any():
+            break
+        near = distance_transform_edt(~np.pad(jolts, 1)) / (3 * _SPREAD * fps)
+        smooth = gaussian_filter1d(change, _SPREAD * fps, axis=0, mode="nearest")
+        change = change + minimum_jerk(1.5 - near)[:, None] * (smooth - change)
+    return change
 
 
 def _touching(playback: Playback, feet: dict[str, FootPath], hands: Sequence[Reach]) -> list[ik.Target]:
@@ -169,7 +208,10 @@ def _touching(playback: Playback, feet: dict[str, FootPath], hands: Sequence[Rea
     effectors = playback.scene.effectors
     pairs = list(zip(effectors, hands, strict=True)) if hands else []
     for foot, path in feet.items():
-        free = 1 - np.max([hand.share for effector, hand in pairs if effector.body == foot] or [[0.0]], axis=0)
+        free = np.ones(playback.num_frames)
+        for effector, hand in pairs:
+            if effector.body == foot:
+                free = np.minimum(free, 1 - hand.share)
         place = free * _SWING + _ramped(path.planted, playback.fps) * (ik.PLANTED_WEIGHT[0] - free * _SWING)
         turn = free * _SWING_TURN + _ramped(path.flat, playback.fps) * (ik.PLANTED_WEIGHT[1] - free * _SWING_TURN)
         targets += [
@@ -177,13 +219,9 @@ def _touching(playback: Playback, feet: dict[str, FootPath], hands: Sequence[Rea
             ik.OrientationTarget(foot, path.rotation.as_quat(scalar_first=True), turn[:, None]),
         ]
     for effector, hand in pairs:
-        weight = _REACH * hand.share[:, None]
-        targets.append(ik.PointTarget(effector.body, hand.pos, weight, effector.point, _on_point(effector)))
+        name = f"{effector.body} on its contact point"
+        targets.append(ik.PointTarget(effector.body, hand.pos, _REACH * hand.share[:, None], effector.point, name))
     return targets
-
-
-def _on_point(effector: Effector) -> str:
-    return f"{effector.body} on its contact point"
 
 
 def _ramped(mask: np.ndarray, fps: float) -> np.ndarray:
@@ -217,10 +255,10 @@ def _obstacles(
 
 
 def _repaired(
-    motion: Motion, object: ObjectConfig | None, thing: Poses | None, robot: RobotConfig, result: ik.IkResult
+    motion: Motion, object: ObjectConfig | None, thing: Poses | None, robot: RobotConfig, qpos: np.ndarray
 ) -> Motion:
     """The motion with the new poses of the robot, of bodies that are rigid with it, and of the object."""
-    new_pos, new_quat = forward_kinematics(robot.model, result.root_pos, result.root_quat, result.joint_pos)
+    new_pos, new_quat = forward_kinematics(robot.model, qpos[:, :3], qpos[:, 3:7], qpos[:, 7:])
     pos, quat = motion.body_pos_w.astype(float), motion.body_quat_w.astype(float)
     carriers = _carriers(motion)
     for i, name in enumerate(motion.body_names):
@@ -239,7 +277,7 @@ def _repaired(
     joint_pos = motion.joint_pos.astype(float)
     for i, name in enumerate(motion.joint_names):
         if name in g1.JOINT_NAMES:
-            joint_pos[:, i] = result.joint_pos[:, g1.JOINT_NAMES.index(name)]
+            joint_pos[:, i] = qpos[:, 7 + g1.JOINT_NAMES.index(name)]
     repaired = motion_from_poses(
         motion.name,
         motion.fps,

@@ -41,7 +41,7 @@ def settled_object(playback: Playback) -> Poses:
     """
     reference = playback.reference
     pos, quat = reference.object_pos.numpy().astype(float), reference.object_quat.numpy().astype(float)
-    held = reference.contact.numpy().any(axis=1)
+    held: np.ndarray = reference.contact.numpy().sum(axis=1) > 0
     rotation = Rotation.from_quat(quat, scalar_first=True)
     clearance = playback.object_clearance.min(axis=1)
     rests, moved = np.zeros(len(pos), bool), np.zeros((len(pos), 6))
