@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -147,9 +146,8 @@ def test_a_good_reference_hardly_changes(lift_box):
 
 def test_a_body_that_is_rigid_with_the_robot_moves_with_it(lift_box):
     motion, parts = cut(lift_box[0], slice(0, 10)), lift_box[1]
-    pos, quat = (
-        getattr(motion, key)[:, motion.body_names.index("torso_link")] for key in ("body_pos_w", "body_quat_w")
-    )
+    torso = motion.body_names.index("torso_link")
+    pos, quat = motion.body_pos_w[:, torso], motion.body_quat_w[:, torso]
 
     def logo(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
         return pos + Rotation.from_quat(quat, scalar_first=True).apply([0.1, 0.0, 0.3])
@@ -160,7 +158,6 @@ def test_a_body_that_is_rigid_with_the_robot_moves_with_it(lift_box):
     lifted.body_pos_w[:, :-3, 2] += 0.04  # neither box nor stand
     lifted.body_pos_w[:, -1, 2] += 0.04
     repaired = repair_motion(lifted, **parts).motion
-    torso = motion.body_names.index("torso_link")
     expected = logo(repaired.body_pos_w[:, torso], repaired.body_quat_w[:, torso])
     np.testing.assert_allclose(repaired.body_pos_w[:, -1], expected, atol=1e-4)
     assert np.abs(repaired.body_pos_w[:, -1] - lifted.body_pos_w[:, -1]).max() > 0.03
@@ -169,12 +166,13 @@ def test_a_body_that_is_rigid_with_the_robot_moves_with_it(lift_box):
 def test_names_rate_labels_and_velocities(lift_box):
     motion, parts = lift_box
     order = [*reversed(range(len(motion.body_names)))]
+    keys = ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w")
     shuffled = replace(
         motion,
         body_names=tuple(motion.body_names[i] for i in order),
         joint_target=motion.joint_pos + 0.1,
-        **{key: getattr(motion, key)[:, order] for key in ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w")},
-    )  # fmt: skip
+        **{key: getattr(motion, key)[:, order] for key in keys},
+    )
     repaired = repair_motion(cut(shuffled, slice(0, 20)), **parts).motion
     assert (repaired.body_names, repaired.joint_names, repaired.fps) == (shuffled.body_names, motion.joint_names, 25.0)
     np.testing.assert_array_equal(repaired.object_contact, motion.object_contact[:20])

@@ -38,6 +38,18 @@ class FootPath:
         """Where the front of the sole should be. [T, 3]"""
         return self.pos + self.rotation.apply(TOE)
 
+    @property
+    def soles(self) -> np.ndarray:
+        """The points of the sole. [T, 4, 3]"""
+        turned = [self.rotation.apply(point) for point in g1.FOOT_POINTS]
+        return self.pos[:, None] + np.stack(turned, axis=1)
+
+    @property
+    def standing(self) -> np.ndarray:
+        """Which of them stand: the front ones are on the toes. bool [T, 4]"""
+        front = np.array([point[0] > 0 for point in g1.FOOT_POINTS])
+        return np.where(front, self.planted[:, None], self.flat[:, None])
+
 
 def foot_path(playback: Playback, foot: str, away: np.ndarray) -> FootPath:
     """The path of a foot whose planted phases have one place each, and one level pose where the sole is flat.

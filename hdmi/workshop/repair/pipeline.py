@@ -27,6 +27,7 @@ from hdmi.motion.kinematics import forward_kinematics, minimum_jerk
 from hdmi.motion.playback import Playback, make_playback
 from hdmi.workshop import ik
 from hdmi.workshop.human import ObjectTrajectory
+from hdmi.workshop.repair.balance import balance_shift
 from hdmi.workshop.repair.feet import FootPath, foot_path
 from hdmi.workshop.repair.ground import lowering
 from hdmi.workshop.repair.hands import Reach, reaches
@@ -42,7 +43,7 @@ _POSTURE = 1.0
 _BALANCE = 20.0
 _SMOOTHING = 0.5
 _PASSES = 2  # of inverse kinematics; each later one follows what the one before made, smoothed
-_FOLLOW = 5.0  # how much more its path counts than the reference's
+_FOLLOW = 3.0  # how much more its path counts than the reference's
 _SPREAD = 0.06  # s; standard deviation over which corrections are smoothed
 _JOLT = (20.0, 150.0)  # m/s^2 and rad/s^2; corrections of the root and of joints that change faster are smoothed again
 _RAMP = 0.08  # s, over which a foot takes hold of the ground
@@ -109,12 +110,12 @@ def repair_motion(
     hands = reaches(playback, object, press, tolerance, reduce) if object is not None and effectors else []
     touching = _touching(playback, feet, hands)
     reference = np.column_stack([playback.qpos[:, :7], playback.qpos[:, playback.scene.joint_qpos]])
-    com = ik.ComTarget(_centre_of_mass(playback), (_BALANCE, _BALANCE, 0.0))
+    com = _centre_of_mass(playback)
     qpos, weight, unsolved = reference, 1.0, set[int]()
     total = _PASSES * motion.num_frames
     for first in range(0, total, motion.num_frames):
         result = ik.solve(
-            [*_near(qpos, weight), com, *touching],
+            [*_near(qpos, weight), ik.ComTarget(com, weight * np.array([_BALANCE, _BALANCE, 0.0])), *touching],
             motion.num_frames,
             motion.fps,
             initial=qpos[0],
@@ -125,6 +126,9 @@ def repair_motion(
         )
         change = _change(result.qpos, reference)
         smooth = gaussian_filter1d(change, _SPREAD * motion.fps, axis=0, mode="nearest")
+        shift = balance_shift(playback, feet, object, _changed(reference, smooth))
+        com[:, :2] += shift
+        smooth[:, :2] += shift
         qpos, weight = _changed(reference, smooth), _FOLLOW
         unsolved |= set(result.failures.tolist())
     qpos = _changed(reference, _calmed(change, motion.fps))
@@ -218,8 +222,8 @@ def _touching(playback: Playback, feet: dict[str, FootPath], hands: Sequence[Rea
             ik.PointTarget(foot, path.toe, place[:, None], TOE),
             ik.OrientationTarget(foot, path.rotation.as_quat(scalar_first=True), turn[:, None]),
         ]
-    for effector, hand in pairs:
-        name = f"{effector.body} on its contact point"
+    for e, (effector, hand) in enumerate(pairs):
+        name = f"effector {e}"
         targets.append(ik.PointTarget(effector.body, hand.pos, _REACH * hand.share[:, None], effector.point, name))
     return targets
 
@@ -249,7 +253,7 @@ def _obstacles(
         angle = playback.reference.object_joint_pos.numpy()
         trajectory = ObjectTrajectory(object.name, *thing, angle[:, 0] if angle.shape[1] else None)
         pairs = zip(playback.scene.effectors, hands, strict=False)
-        yields = {effector.body: press * hand.share for effector, hand in pairs}
+        yields = {effector.body: (effector.press + press) * hand.share for effector, hand in pairs}
         out += [replace(obstacle, yields=yields) for obstacle in obstacles(object, trajectory)]
     return out
 
