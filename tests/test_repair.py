@@ -214,6 +214,7 @@ def report(**values: tuple[float | None, str]) -> Report:
     [
         ((0.5, "good"), (0.9, "good"), False),
         ((0.9, "good"), (1.1, "usable"), True),
+        ((0.98, "good"), (1.02, "usable"), False),
         ((2.0, "usable"), (2.1, "usable"), False),
         ((2.0, "usable"), (2.5, "usable"), True),
         ((2.0, "usable"), (1.5, "usable"), False),

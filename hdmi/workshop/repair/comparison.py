@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 from rich.table import Table
 
-from hdmi.workshop.validate import Finding, Report
+from hdmi.workshop.validate import Finding, Report, Verdict
+from hdmi.workshop.validate.report import STYLE
 
-_SLACK = 1.1  # a check that was not good may rise by this factor
-_ORDER = ("good", "usable", "bad")
-_STYLE = {"good": "green", "usable": "yellow", "bad": "red"}
+_SLACK = 1.1  # a quantity above its limit is worse from this factor on
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class Comparison:
 
     @property
     def worse(self) -> tuple[str, ...]:
-        """Why the motion is not at least as good as before: of each check that is worse, and not good."""
+        """Why the motion is not as good as before: checks above their limit by more than a tenth more, or newly bad."""
         earlier = {finding.check: finding for finding in self.before.findings}
         found = []
         for finding in self.after.findings:
@@ -58,10 +57,10 @@ class Comparison:
 
 
 def _is_worse(before: Finding, after: Finding) -> bool:
-    if after.verdict == "good":
+    if after.verdict == "good" or before == after:
         return False
-    if _ORDER.index(after.verdict) > _ORDER.index(before.verdict) or after.value is None or before.value is None:
-        return after != before
+    if before.value is None or after.value is None or (after.verdict == "bad" and before.verdict != "bad"):
+        return True
     return after.value > _SLACK * before.value
 
 
@@ -69,5 +68,5 @@ def _value(finding: Finding | None) -> str:
     return "-" if finding is None or finding.value is None else f"{finding.value:.3g}"
 
 
-def _coloured(verdict: str) -> str:
-    return f"[{_STYLE[verdict]}]{verdict}[/{_STYLE[verdict]}]"
+def _coloured(verdict: Verdict) -> str:
+    return f"[{STYLE[verdict]}]{verdict}[/{STYLE[verdict]}]"

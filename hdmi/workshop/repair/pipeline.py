@@ -55,6 +55,7 @@ class Repair:
     """A repaired motion, and what inverse kinematics could not do.
 
     Examples:
+        >>> from dataclasses import replace
         >>> from hdmi.motion import find_motion, load_motion
         >>> walk = load_motion(find_motion("walk"))
         >>> short = replace(walk, **{key: value[:5] for key, value in vars(walk).items() if np.ndim(value) > 1})
