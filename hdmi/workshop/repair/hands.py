@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from hdmi.assets import ObjectConfig
 from hdmi.assets.surface import object_surfaces
@@ -14,6 +15,7 @@ from hdmi.workshop.annotate import intervals
 
 _EASE = 0.25  # s, over which an effector comes to its contact point, or longer,
 _PACE = 0.5  # m/s, where it would be faster than this
+_FARTHEST = 0.1  # m; a contact point further from where an effector would touch is believed
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,7 @@ class Reach:
 
     pos: np.ndarray  # [T, 3] m
     share: np.ndarray  # [T]
+    inward: np.ndarray  # [T, 3] unit vectors into the object
 
 
 def reaches(
@@ -37,9 +40,9 @@ def reaches(
     label = playback.reference.contact.numpy()
     points = playback.reference.contact_point.numpy().astype(float)  # [T, E, 3]
     surface = object_surfaces(object)[object.link]
-    inward = surface.inward(points.reshape(-1, 3)).reshape(points.shape)
     pos, mat = playback.body_poses(playback.scene.object_link)
-    goals = pos[:, None] + np.einsum("tij,tej->tei", mat, points + press * inward)
+    inward = np.einsum("tij,tej->tei", mat, surface.inward(points.reshape(-1, 3)).reshape(points.shape))
+    goals = pos[:, None] + np.einsum("tij,tej->tei", mat, points) + press * inward
     actual = playback.effector_pos_w
     apart = np.linalg.norm(actual - goals, axis=-1)
     if reduce == "max":
@@ -52,7 +55,25 @@ def reaches(
     out = []
     for e in range(label.shape[1]):
         change, share = _eased(label[:, e], local[:, e], playback.fps)
-        out.append(Reach(actual[:, e] + np.einsum("tij,tj->ti", mat, change), share))
+        out.append(Reach(actual[:, e] + np.einsum("tij,tj->ti", mat, change), share, inward[:, e]))
+    return out
+
+
+def pressed(playback: Playback, reaches: list[Reach], press: float) -> list[Reach]:
+    """The same paths, moved along the surface's normal so that the effectors' shapes are pressed in where they touch.
+
+    A contact point says where an effector's point should be, and may be outside of the surface by a hand's thickness.
+
+    Args:
+        playback: of a motion that follows the paths.
+    """
+    out = []
+    for effector, reach in zip(playback.scene.effectors, reaches, strict=True):
+        geoms = playback.robot_geoms[playback.on_bodies([effector.body])]
+        gap = playback.distances(geoms, playback.scene.object_geoms).min(axis=1)
+        missing = np.where(reach.share == 1, (gap + effector.press + press).clip(-_FARTHEST, _FARTHEST), 0.0)
+        smooth = gaussian_filter1d(missing, _EASE / 3 * playback.fps, mode="nearest") * reach.share
+        out.append(replace(reach, pos=reach.pos + smooth[:, None] * reach.inward))
     return out
 
 

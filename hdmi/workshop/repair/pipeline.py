@@ -30,17 +30,17 @@ from hdmi.workshop.human import ObjectTrajectory
 from hdmi.workshop.repair.balance import balance_shift
 from hdmi.workshop.repair.feet import FootPath, foot_path
 from hdmi.workshop.repair.ground import lowering
-from hdmi.workshop.repair.hands import Reach, reaches
+from hdmi.workshop.repair.hands import Reach, pressed, reaches
 from hdmi.workshop.repair.rest import Poses, settled_object
 from hdmi.workshop.retarget.body import TOE
 from hdmi.workshop.retarget.object import obstacles
 
 # Weights per m and per rad: what touches the world counts most, then where the trunk is, then the reference's joints.
-_REACH = 60.0
-_PELVIS, _PELVIS_TURN, _TORSO_TURN = 10.0, 5.0, 10.0
+_REACH = 40.0
+_PELVIS, _PELVIS_TURN, _TORSO_TURN = 10.0, 5.0, 20.0
 _SWING, _SWING_TURN = 30.0, 8.0
 _POSTURE = 1.0
-_BALANCE = 20.0
+_BALANCE = 8.0
 _SMOOTHING = 0.5
 _PASSES = 2  # of inverse kinematics; each later one follows what the one before made, smoothed
 _FOLLOW = 3.0  # how much more its path counts than the reference's
@@ -102,21 +102,23 @@ def repair_motion(
     if effectors and motion.object_contact is None:
         raise MotionError(f"motion {motion.name!r}: has no object_contact labels; annotate it first")
     absent = [name for name in g1.JOINT_NAMES if name not in motion.joint_names]
-    robot = replace(robot, feet="sphere", held=[*robot.held_joints, *absent])
-    playback = make_playback(motion, robot=robot, object=object, scenery=scenery, effectors=effectors)
+    robot = replace(robot, held=[*robot.held_joints, *absent])
+    points = replace(robot, feet="sphere")  # points tell a foot on its toes from one on its sole
+    playback = make_playback(motion, robot=points, object=object, scenery=scenery, effectors=effectors)
     thing = settled_object(playback) if object is not None else None
     playback = _placed(playback, thing)
-    playback = _placed(playback, thing, lowering(playback))
+    reference = _robot_qpos(playback)
+    reference[:, 2] += lowering(playback)
+    playback = _placed(playback, qpos=reference)
     feet = {foot: foot_path(playback, foot, _pushing(playback, foot)) for foot in g1.FEET}
     hands = reaches(playback, object, press, tolerance, reduce) if object is not None and effectors else []
-    touching = _touching(playback, feet, hands)
-    reference = np.column_stack([playback.qpos[:, :7], playback.qpos[:, playback.scene.joint_qpos]])
     com = _centre_of_mass(playback)
     qpos, weight, unsolved = reference, 1.0, set[int]()
     total = _PASSES * motion.num_frames
     for first in range(0, total, motion.num_frames):
+        balance = ik.ComTarget(com, weight * np.array([_BALANCE, _BALANCE, 0.0]))
         result = ik.solve(
-            [*_near(qpos, weight), ik.ComTarget(com, weight * np.array([_BALANCE, _BALANCE, 0.0])), *touching],
+            [*_near(qpos, weight), balance, *_touching(playback, feet, hands)],
             motion.num_frames,
             motion.fps,
             initial=qpos[0],
@@ -131,6 +133,8 @@ def repair_motion(
         com[:, :2] += shift
         smooth[:, :2] += shift
         qpos, weight = _changed(reference, smooth), _FOLLOW
+        if tolerance == 0:
+            hands = pressed(_placed(playback, qpos=result.qpos), hands, press)
         unsolved |= set(result.failures.tolist())
     qpos = _changed(reference, _calmed(change, motion.fps))
     qpos[:, 7:] = np.clip(qpos[:, 7:], *np.array(g1.JOINT_RANGES).T)
@@ -144,13 +148,19 @@ def _tell(on_frame: Callable[[int, int], None], first: int, total: int, frame: i
     on_frame(first + frame + 1, total)
 
 
-def _placed(playback: Playback, thing: Poses | None, up: np.ndarray | float = 0.0) -> Playback:
-    """The playback with its object elsewhere, and the robot moved up. [T, 3], [T, 4]; [T] m"""
-    qpos, q = playback.qpos.copy(), playback.scene.object_free_qpos
-    qpos[:, 2] += up
-    if thing is not None and q is not None:
-        qpos[:, q : q + 3], qpos[:, q + 3 : q + 7] = thing
-    return replace(playback, qpos=qpos)
+def _placed(playback: Playback, thing: Poses | None = None, qpos: np.ndarray | None = None) -> Playback:
+    """The playback with its object or its robot elsewhere. [T, 3], [T, 4]; [T, 36]"""
+    scene, placed = playback.scene, playback.qpos.copy()
+    if qpos is not None:
+        placed[:, :7], placed[:, scene.joint_qpos] = qpos[:, :7], qpos[:, 7:]
+    if thing is not None and (q := scene.object_free_qpos) is not None:
+        placed[:, q : q + 3], placed[:, q + 3 : q + 7] = thing
+    return replace(playback, qpos=placed)
+
+
+def _robot_qpos(playback: Playback) -> np.ndarray:
+    """Of the robot alone. [T, 36]"""
+    return np.column_stack([playback.qpos[:, :7], playback.qpos[:, playback.scene.joint_qpos]])
 
 
 def _pushing(playback: Playback, body: str) -> np.ndarray:
@@ -164,7 +174,7 @@ def _near(qpos: np.ndarray, weight: float) -> list[ik.Target]:
     """Targets near a path of the robot. [T, 36]"""
     _, quat = forward_kinematics(g1_robot(), qpos[:, :3], qpos[:, 3:7], qpos[:, 7:])
     return [
-        ik.PointTarget("pelvis", qpos[:, :3], weight * np.asarray(_PELVIS)),
+        ik.PointTarget("pelvis", qpos[:, :3], weight * _PELVIS),
         ik.OrientationTarget("pelvis", qpos[:, 3:7], weight * _PELVIS_TURN),
         ik.OrientationTarget("torso_link", quat[:, g1.BODY_NAMES.index("torso_link")], weight * _TORSO_TURN),
         ik.PostureTarget(qpos[:, 7:], weight * _POSTURE),

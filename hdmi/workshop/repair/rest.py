@@ -24,14 +24,14 @@ class Poses(NamedTuple):
 
 
 def at_rest(pos: np.ndarray, quat: np.ndarray, fps: float, held: np.ndarray) -> list[tuple[int, int]]:
-    """First and last frames of the phases in which an object does not move, and nothing holds it all along.
+    """First and last frames of the phases in which an object does not move, and is not held for most of the time.
 
     Args:
         held: frames in which an effector is to touch it. bool [T]
     """
     speed = np.linalg.norm(derivative(pos, fps), axis=-1)
     speed += _LEVER * np.linalg.norm(angular_velocity(quat, fps), axis=-1)
-    return [(first, last) for first, last in intervals(speed < _SLOW) if not held[first : last + 1].all()]
+    return [(first, last) for first, last in intervals(speed < _SLOW) if held[first : last + 1].mean() < 0.5]
 
 
 def settled_object(playback: Playback) -> Poses:
