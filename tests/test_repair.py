@@ -19,6 +19,7 @@ from hdmi.motion.complete import complete_robot
 from hdmi.motion.kinematics import derivative, forward_kinematics, minimum_jerk
 from hdmi.workshop.ik import Obstacle, PointTarget, PostureTarget, solve, standing
 from hdmi.workshop.repair import Comparison, repair_motion
+from hdmi.workshop.repair.rest import at_rest
 from hdmi.workshop.validate import Finding, Report
 
 pytest.importorskip("mink")
@@ -134,6 +135,24 @@ class TestBroken:
         repaired = repair_motion(with_robot(motion, up=0.04), **parts).motion
         waist = motion.joint_names.index("waist_yaw_joint")
         assert np.abs(repaired.joint_pos[:, waist] - motion.joint_pos[:, waist]).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("speed", "held", "rests"),  # in each fifth of a second
+    [
+        ([0, 0, 0, 1, 1, 0, 0], [0, 1, 1, 1, 1, 0, 0], [1, 1, 1, 0, 0, 1, 1]),  # taken and put down
+        ([1, 1, 0, 0, 0, 1, 1], [1, 1, 1, 1, 1, 1, 1], [0, 0, 0, 0, 0, 0, 0]),  # held still
+        ([1, 0, 0, 0, 0, 1, 1], [1, 1, 1, 1, 0, 0, 0], [0, 0, 0, 0, 0, 0, 0]),  # held still, and let go
+    ],
+)
+def test_when_an_object_rests(speed, held, rests):
+    fps, span = 50.0, 10
+    path = np.cumsum(np.repeat(speed, span)) / fps
+    pos, quat = np.outer(path, [1.0, 0.0, 0.0]), np.tile([1.0, 0.0, 0.0, 0.0], (len(path), 1))
+    found = np.zeros(len(path), int)
+    for first, last in at_rest(pos, quat, fps, np.repeat(held, span).astype(bool)):
+        found[first : last + 1] = 1
+    assert found[span // 2 :: span].tolist() == rests
 
 
 def test_a_good_reference_hardly_changes(lift_box):

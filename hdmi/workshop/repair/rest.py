@@ -24,14 +24,21 @@ class Poses(NamedTuple):
 
 
 def at_rest(pos: np.ndarray, quat: np.ndarray, fps: float, held: np.ndarray) -> list[tuple[int, int]]:
-    """First and last frames of the phases in which an object does not move, and is not held for most of the time.
+    """First and last frames of the phases in which an object does not move, and stands on its own.
+
+    It does not where it is held all along, nor where it is held mostly, and then let go and falls.
 
     Args:
         held: frames in which an effector is to touch it. bool [T]
     """
     speed = np.linalg.norm(derivative(pos, fps), axis=-1)
     speed += _LEVER * np.linalg.norm(angular_velocity(quat, fps), axis=-1)
-    return [(first, last) for first, last in intervals(speed < _SLOW) if held[first : last + 1].mean() < 0.5]
+    out = []
+    for first, last in intervals(speed < _SLOW):
+        within, falls = held[first : last + 1], last + 1 < len(held) and not held[last + 1]
+        if not within.all() and not (falls and within.mean() > 0.5):
+            out.append((first, last))
+    return out
 
 
 def settled_object(playback: Playback) -> Poses:
