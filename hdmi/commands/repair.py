@@ -65,6 +65,8 @@ def repair(arguments: list[str], console: Console) -> int:
     comparison = Comparison(before, validate_motion(repaired.motion, **parts))
     folder = save_motion(repaired.motion, out)
     console.print(comparison.table())
+    stands = ", ".join(f"{foot} {100 * share:.0f} %" for foot, share in repaired.planted.items())
+    console.print(f"planted, of all frames: {stands}", soft_wrap=True, highlight=False)
     if repaired.unsolved:
         console.print(f"frames without a solution: {', '.join(map(str, repaired.unsolved))}", soft_wrap=True)
     for reason in comparison.worse:

@@ -5,14 +5,14 @@
 2. Feet get one place for each of their planted phases (`feet`), end effectors their contact points while contact is
    labelled (`hands`).
 3. Inverse kinematics finds the joints, within ranges and speeds, and without entering floor, scenery or object;
-   everything that this leaves open is as in the reference.
+   everything that this leaves open is as in the reference. A second pass follows the path of the first, smoothed, with
+   the centre of mass over the feet (`balance`) and the effectors' shapes where they touch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import mujoco
 import numpy as np
@@ -42,10 +42,10 @@ _SWING, _SWING_TURN = 30.0, 8.0
 _POSTURE = 1.0
 _BALANCE = 8.0
 _SMOOTHING = 0.5
-_PASSES = 2  # of inverse kinematics; each later one follows what the one before made, smoothed
-_FOLLOW = 3.0  # how much more its path counts than the reference's
+_FOLLOW = 3.0  # how much more the smoothed path of a first pass counts in a second one than the reference in the first
 _SPREAD = 0.06  # s; standard deviation over which corrections are smoothed
 _JOLT = (20.0, 150.0)  # m/s^2 and rad/s^2; corrections of the root and of joints that change faster are smoothed again
+_CALMINGS = 2  # at most
 _RAMP = 0.08  # s, over which a foot takes hold of the ground
 _RIGID = 1e-3  # m; a body whose place in the frame of one of the robot's varies less moves with it
 
@@ -113,39 +113,35 @@ def repair_motion(
     feet = {foot: foot_path(playback, foot, _pushing(playback, foot)) for foot in g1.FEET}
     hands = reaches(playback, object, press, tolerance, reduce) if object is not None and effectors else []
     com = _centre_of_mass(playback)
-    qpos, weight, unsolved = reference, 1.0, set[int]()
-    total = _PASSES * motion.num_frames
-    for first in range(0, total, motion.num_frames):
-        balance = ik.ComTarget(com, weight * np.array([_BALANCE, _BALANCE, 0.0]))
-        result = ik.solve(
-            [*_near(qpos, weight), balance, *_touching(playback, feet, hands)],
+
+    def solved(near: list[ik.Target], com: ik.ComTarget, hands: list[Reach], done: int) -> ik.IkResult:
+        return ik.solve(
+            [*near, com, *_touching(playback, feet, hands)],
             motion.num_frames,
             motion.fps,
-            initial=qpos[0],
+            initial=reference[0],
             obstacles=_obstacles(playback, object, thing, scenery, hands, press),
             options=ik.IkOptions(floor=0.0, limit_margin=0.0, smoothing=_SMOOTHING, self_collision=0.0),
             robot=robot,
-            on_frame=None if on_frame is None else partial(_tell, on_frame, first, total),
+            on_frame=None if on_frame is None else lambda t: on_frame(done + t + 1, 2 * motion.num_frames),
         )
-        change = _change(result.qpos, reference)
-        smooth = gaussian_filter1d(change, _SPREAD * motion.fps, axis=0, mode="nearest")
-        shift = balance_shift(playback, feet, object, _changed(reference, smooth))
-        com[:, :2] += shift
-        smooth[:, :2] += shift
-        qpos, weight = _changed(reference, smooth), _FOLLOW
-        if tolerance == 0:
-            hands = pressed(_placed(playback, qpos=result.qpos), hands, press)
-        unsolved |= set(result.failures.tolist())
-    qpos = _changed(reference, _calmed(change, motion.fps))
+
+    first = solved(_near(reference, 1.0), _over(com, 1.0), hands, 0)
+    change = _change(first.qpos, reference)
+    smooth = gaussian_filter1d(change, _SPREAD * motion.fps, axis=0, mode="nearest")
+    shift = balance_shift(playback, feet, object, _changed(reference, smooth))
+    com[:, :2] += shift
+    smooth[:, :2] += shift
+    if tolerance == 0:
+        hands = pressed(_placed(playback, qpos=first.qpos), hands, press)
+    second = solved(_near(_changed(reference, smooth), _FOLLOW), _over(com, _FOLLOW), hands, motion.num_frames)
+    qpos = _changed(reference, _calmed(_change(second.qpos, reference), motion.fps))
     qpos[:, 7:] = np.clip(qpos[:, 7:], *np.array(g1.JOINT_RANGES).T)
     held = np.isin(g1.JOINT_NAMES, robot.held_joints)
     qpos[:, 7:][:, held] = robot.default_joint_pos[held]
     planted = {foot: float(path.planted.mean()) for foot, path in feet.items()}
-    return Repair(_repaired(motion, object, thing, robot, qpos), planted, sorted(unsolved))
-
-
-def _tell(on_frame: Callable[[int, int], None], first: int, total: int, frame: int) -> None:
-    on_frame(first + frame + 1, total)
+    unsolved = np.union1d(first.failures, second.failures).tolist()
+    return Repair(_repaired(motion, object, thing, robot, qpos), planted, unsolved)
 
 
 def _placed(playback: Playback, thing: Poses | None = None, qpos: np.ndarray | None = None) -> Playback:
@@ -181,6 +177,11 @@ def _near(qpos: np.ndarray, weight: float) -> list[ik.Target]:
     ]
 
 
+def _over(com: np.ndarray, weight: float) -> ik.ComTarget:
+    """The centre of mass over the ground where it should be; its height follows from the rest. [T, 3]"""
+    return ik.ComTarget(com, (weight * _BALANCE, weight * _BALANCE, 0.0))
+
+
 def _centre_of_mass(playback: Playback) -> np.ndarray:
     """The robot's, m. [T, 3]"""
     model, out = playback.scene.model, np.empty((playback.num_frames, 3))
@@ -207,7 +208,7 @@ def _changed(reference: np.ndarray, change: np.ndarray) -> np.ndarray:
 def _calmed(change: np.ndarray, fps: float) -> np.ndarray:
     """The change without jolts, where a contact stops the robot within a frame: smoothed around them. [T, 35]"""
     limit = np.repeat([_JOLT[0], _JOLT[1]], [3, change.shape[1] - 3])
-    for _ in range(_PASSES):
+    for _ in range(_CALMINGS):
         jolts = (np.abs(np.diff(change, 2, axis=0)) * fps**2 > limit).any(axis=1)
         if not jolts.any():
             break
