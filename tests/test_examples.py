@@ -18,6 +18,7 @@ from test_docs import public_names
 EXTRAS = {
     "hdmi.workshop.author.solve": "mink",
     "hdmi.workshop.ik": "mink",
+    "hdmi.workshop.repair.pipeline": "mink",
     "hdmi.workshop.retarget.measures": "mink",
     "hdmi.workshop.view.browser": "viser",
 }

@@ -21,6 +21,7 @@ VERBS = {
     "convert": "reference motions from and to other projects' formats",
     "annotate": "finds contacts, and completes the object's trajectory",
     "validate": "whether a motion is worth training on",
+    "repair": "puts a motion's feet on the ground and its hands on the object",
     "view": "shows a motion, as a video or in the browser",
     "author": "makes a motion from a plan of keyframes",
     "benchmark": "speed of physics, environment, learner and training",

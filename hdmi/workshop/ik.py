@@ -13,8 +13,8 @@ arithmetic: what already penetrates may not go deeper, and is pushed out as a he
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib import import_module
 from typing import Any
@@ -130,6 +130,7 @@ class Obstacle:
         name: not one of the robot's bodies.
         geoms: in its frame, as those of `hdmi.assets.ObjectConfig`.
         pos, quat: world. [T, 3] or [3], [T, 4] or [4]
+        yields: how deep bodies of the robot may enter nevertheless, m; those not named may not. [T] or one figure
 
     Examples:
         >>> wall = Obstacle("wall", geoms=[{"box": (0.1, 2.0, 2.0)}], pos=[0.45, 0.0, 0.0], quat=[1.0, 0.0, 0.0, 0.0])
@@ -143,6 +144,7 @@ class Obstacle:
     geoms: Sequence[Any]
     pos: ArrayLike
     quat: ArrayLike
+    yields: Mapping[str, ArrayLike] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -228,6 +230,7 @@ def solve(
     initial: np.ndarray | None = None,
     obstacles: Sequence[Obstacle] = (),
     options: IkOptions | None = None,
+    robot: RobotConfig | None = None,
     on_frame: Callable[[int], None] | None = None,
 ) -> IkResult:
     """Finds the robot's motion that meets the targets best.
@@ -239,6 +242,7 @@ def solve(
         initial: where the first frame starts from; standing at the origin if absent. [36]
         obstacles: what the robot may not enter.
         options: see the class.
+        robot: the G1 with the collision shapes of a task; joints that it holds stay at its default pose.
         on_frame: called with the index of every frame once it is solved.
 
     Raises:
@@ -248,13 +252,13 @@ def solve(
     """
     mink = _require_mink()
     options = options or IkOptions()
-    model, mocap = _model(options, obstacles)
+    model, mocap = _model(options, obstacles, robot)
     rows = _Rows(model, targets, num_frames, options.smoothing)
     poses = [_obstacle_poses(obstacle, num_frames) for obstacle in obstacles]
     configuration = mink.Configuration(model, q=standing() if initial is None else np.asarray(initial, float))
     data = configuration.data
-    bounds = _Bounds(model, options, fps, mink.Constraint)
-    contacts = _Contacts(model, options, mink.Constraint)
+    bounds = _Bounds(model, options, robot or RobotConfig(), fps, mink.Constraint)
+    contacts = _Contacts(model, options, _yields(model, obstacles, num_frames), mink.Constraint)
     before: np.ndarray | None = None
     qpos, iterations = np.empty((num_frames, model.nq)), np.zeros(num_frames, int)
     failures, unsettled = [], []
@@ -267,7 +271,7 @@ def solve(
     for t in range(num_frames):
         for i, (pos, quat) in zip(mocap, poses, strict=True):
             data.mocap_pos[i], data.mocap_quat[i] = pos[t], quat[t]
-        rows.frame, settled = t, False
+        rows.frame, contacts.frame, settled = t, t, False
         bounds.set_window(before)
         if t > 0:
             rows.expected = qpos[t - 1, 7:] + _PERSISTENCE * (qpos[t - 1, 7:] - qpos[max(t - 2, 0), 7:])
@@ -327,11 +331,13 @@ def _require_mink() -> Any:
         ) from error
 
 
-def _model(options: IkOptions, obstacles: Sequence[Obstacle]) -> tuple[mujoco.MjModel, list[int]]:
+def _model(
+    options: IkOptions, obstacles: Sequence[Obstacle], robot: RobotConfig | None = None
+) -> tuple[mujoco.MjModel, list[int]]:
     """The robot, the floor and the obstacles as mocap bodies; and the obstacles' mocap indices."""
-    if not obstacles:
+    if not obstacles and robot is None:
         return _bare_model(options.self_collision is not None, options.floor), []
-    spec = _spec(options.self_collision is not None, options.floor)
+    spec = _spec(options.self_collision is not None, options.floor, robot or RobotConfig())
     for obstacle in obstacles:
         if obstacle.name in g1.BODY_NAMES:
             raise ValueError(f"obstacle {obstacle.name!r}: is the name of a body of the robot")
@@ -343,13 +349,13 @@ def _model(options: IkOptions, obstacles: Sequence[Obstacle]) -> tuple[mujoco.Mj
 
 @lru_cache(maxsize=4)
 def _bare_model(self_collisions: bool, floor: float | None) -> mujoco.MjModel:
-    return _with_reach(_spec(self_collisions, floor).compile())
+    return _with_reach(_spec(self_collisions, floor, RobotConfig()).compile())
 
 
-def _spec(self_collisions: bool, floor: float | None) -> mujoco.MjSpec:
+def _spec(self_collisions: bool, floor: float | None, robot: RobotConfig) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
-    spec = add_robot(spec, RobotConfig(self_collisions=self_collisions))
+    spec = add_robot(spec, replace(robot, self_collisions=self_collisions))
     if floor is not None:
         spec.worldbody.add_geom(
             name="floor",
@@ -372,6 +378,19 @@ def _obstacle_poses(obstacle: Obstacle, num_frames: int) -> tuple[np.ndarray, np
         _per_frame(f"obstacle {obstacle.name!r}: pos", obstacle.pos, num_frames, 3),
         _per_frame(f"obstacle {obstacle.name!r}: quat", obstacle.quat, num_frames, 4),
     )
+
+
+def _yields(model: mujoco.MjModel, obstacles: Sequence[Obstacle], num_frames: int) -> dict[tuple[int, int], np.ndarray]:
+    """Depths to which obstacles yield, by the ids of the robot's body and theirs, m. [T]"""
+    out = {}
+    for obstacle in obstacles:
+        for body, depth in obstacle.yields.items():
+            if body not in g1.BODY_NAMES:
+                raise ValueError(f"obstacle {obstacle.name!r}: yields: the robot has no body {body!r}")
+            column = np.asarray(depth, float).reshape(-1, 1)
+            where = f"obstacle {obstacle.name!r}: yields: {body}"
+            out[model.body(body).id, model.body(obstacle.name).id] = _per_frame(where, column, num_frames, 1)[:, 0]
+    return out
 
 
 def _per_frame(where: str, value: ArrayLike, num_frames: int, width: int) -> np.ndarray:
@@ -497,11 +516,16 @@ def _checked(model: mujoco.MjModel, target: Target, num_frames: int) -> _Row:
 
 
 class _Bounds:
-    """Joint ranges, velocity limits against the frame before, and the longest step, as one limit."""
+    """Joint ranges, velocity limits against the frame before, and the longest step, as one limit.
 
-    def __init__(self, model: mujoco.MjModel, options: IkOptions, fps: float, constraint: Any):
+    A joint that the robot holds has no range.
+    """
+
+    def __init__(self, model: mujoco.MjModel, options: IkOptions, robot: RobotConfig, fps: float, constraint: Any):
         low, high = np.array(g1.JOINT_RANGES).T
-        self._low, self._high = low + options.limit_margin, high - options.limit_margin
+        held, pose = np.isin(g1.JOINT_NAMES, robot.held_joints), robot.default_joint_pos
+        self._low = np.where(held, pose, low + options.limit_margin)
+        self._high = np.where(held, pose, high - options.limit_margin)
         speeds = np.array([joint.velocity_limit for joint in g1.JOINTS])
         self._reach = options.velocity_scale * speeds / fps
         self._max_step = options.max_step
@@ -537,7 +561,9 @@ class _Contacts:
 
     model: mujoco.MjModel
     options: IkOptions
+    yields: Mapping[tuple[int, int], np.ndarray]  # by body ids of robot and obstacle, m. [T]
     constraint: Any
+    frame: int = 0
     _gaps: np.ndarray = field(default_factory=lambda: np.zeros(0))  # [C] m
     _normals: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # [C, nv] of the gap by the positions
 
@@ -553,14 +579,17 @@ class _Contacts:
                 mujoco.mj_jac(self.model, data, jac, None, contact.pos, body)
                 normal += sign * (contact.frame[:3] @ jac)
             if normal.any():  # not obstacle against floor
-                clearance = self.options.self_collision or 0.0
-                gaps.append(contact.dist - (clearance if self._is_self(first, second) else 0.0))
+                gaps.append(contact.dist - self._clearance(int(first), int(second)))
                 normals.append(normal)
         self._gaps, self._normals = np.array(gaps), np.array(normals).reshape(-1, self.model.nv)
         return float((_PUSH_WEIGHT * np.minimum(self._gaps, 0.0)) @ (_PUSH_WEIGHT * np.minimum(self._gaps, 0.0)))
 
-    def _is_self(self, first: int, second: int) -> bool:
-        return first in _ROBOT and second in _ROBOT
+    def _clearance(self, first: int, second: int) -> float:
+        """Distance that two bodies have to keep, negative where one may enter the other, m."""
+        if first in _ROBOT and second in _ROBOT:
+            return self.options.self_collision or 0.0
+        depth = self.yields.get((min(first, second), max(first, second)))  # obstacles come after the robot
+        return 0.0 if depth is None else -float(depth[self.frame])
 
     @property
     def others(self) -> list[str]:

@@ -45,26 +45,27 @@ def find_stances(body: Body, fps: float) -> Stances:
     """Finds when feet stand: their joints barely move for a while, at whatever height."""
     toe, flat = {}, {}
     for side in SIDES:
-        ankle = _still(body.pos[f"{side}_ankle"], fps)
-        front = _still(body.pos[f"{side}_foot"], fps) if f"{side}_foot" in body.pos else ankle
-        flat[side] = _lasting(ankle & front & (np.abs(body.foot_pitch[side]) < _LEVEL), fps)
-        toe[side] = _lasting(front, fps) | flat[side]
+        ankle = keeps_still(body.pos[f"{side}_ankle"], fps)
+        front = keeps_still(body.pos[f"{side}_foot"], fps) if f"{side}_foot" in body.pos else ankle
+        flat[side] = lasting(ankle & front & (np.abs(body.foot_pitch[side]) < _LEVEL), fps)
+        toe[side] = lasting(front, fps) | flat[side]
     return Stances(toe, flat)
 
 
-def _still(path: np.ndarray, fps: float, speed: float = _STANDING_SPEED) -> np.ndarray:
+def keeps_still(path: np.ndarray, fps: float, speed: float = _STANDING_SPEED) -> np.ndarray:
     """Where a joint is slower than `speed` for a while; what drifts nevertheless has to be slower still. bool [T]"""
-    still = _lasting(np.linalg.norm(np.gradient(path, 1 / fps, axis=0), axis=-1) < speed, fps)
+    still = lasting(np.linalg.norm(np.gradient(path, 1 / fps, axis=0), axis=-1) < speed, fps)
     stretches, count = label(still)
     for stretch in range(1, count + 1):
         frames = stretches == stretch
         drift = np.linalg.norm(path[frames] - path[frames].mean(0), axis=-1).max()
         if drift > _DRIFT and frames.sum() > 1 and speed > _SLOWEST:
-            still[frames] = _still(path[frames], fps, speed / 2)
+            still[frames] = keeps_still(path[frames], fps, speed / 2)
     return still
 
 
-def _lasting(mask: np.ndarray, fps: float) -> np.ndarray:
+def lasting(mask: np.ndarray, fps: float) -> np.ndarray:
+    """Without short interruptions, and then without what is short. bool [T]"""
     window = np.ones(max(round(_SHORTEST * fps), 1), bool)
     padded = np.pad(mask, len(window), mode="edge")
     return binary_opening(binary_closing(padded, window), window)[len(window) : -len(window)]
@@ -89,7 +90,7 @@ def foot_paths(body: Body, stances: Stances, scaling: Scaling, fps: float) -> Fo
         # place, yaw and pitch of the foot together, so that they are corrected together. [T, 5]
         free = np.column_stack([base, body.foot_yaw[side], body.foot_pitch[side]])
         fixed = _standing(free, stances.toe[side], stances.flat[side], fps)
-        path = free + _carried_over(fixed - free, stances.toe[side])
+        path = free + carried_over(fixed - free, stances.toe[side])
         pos[side] = path[:, :3]
         quat[side] = _foot_rotation(path[:, 3], path[:, 4]).as_quat(scalar_first=True)
     return FootPaths(pos, quat, stances)
@@ -121,7 +122,7 @@ def _standing(free: np.ndarray, toe: np.ndarray, flat: np.ndarray, fps: float) -
     return out
 
 
-def _carried_over(correction: np.ndarray, stance: np.ndarray) -> np.ndarray:
+def carried_over(correction: np.ndarray, stance: np.ndarray) -> np.ndarray:
     """Corrections in stances, eased from one to the next in the swings between. [T, D]"""
     out = correction.copy()
     if not stance.any():

@@ -16,7 +16,7 @@ from hdmi.workshop.validate.limits import Limit
 
 Verdict = Literal["good", "usable", "bad"]  # of a check, and of a motion
 _ORDER: tuple[Verdict, ...] = ("good", "usable", "bad")
-_STYLE = {"good": "green", "usable": "yellow", "bad": "red"}
+STYLE = {"good": "green", "usable": "yellow", "bad": "red"}
 
 
 @dataclass(frozen=True)
@@ -140,13 +140,13 @@ class Report:
 
     def table(self) -> Table:
         """All checks: value, bounds, verdict, the part and the frames at fault."""
-        style = _STYLE[self.verdict]
+        style = STYLE[self.verdict]
         length = f"{self.num_frames} frames at {self.fps:g} Hz: " if self.num_frames else ""
         table = Table(title=f"{self.motion}: {length}[{style}]{self.verdict}[/{style}]", title_justify="left")
         for column in ("check", "value", "good", "bad", "unit", "verdict", "worst", "frames at fault"):
             table.add_column(column, justify="right" if column in ("value", "good", "bad") else "left")
         for finding in self.findings:
-            style = _STYLE[finding.verdict]
+            style = STYLE[finding.verdict]
             worst = max(finding.faults, key=lambda fault: fault.value, default=None)
             faulty = worst is not None and finding.verdict != "good"
             table.add_row(
