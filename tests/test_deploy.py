@@ -459,14 +459,16 @@ def limited(target: list[float], pos: list[float], vel: list[float], **limits: f
     )
 
 
-def test_targets_stay_in_the_joint_ranges():
-    assert limited([3.0, -0.7], [2.0, -0.5], [0.0, 0.0]) == pytest.approx([2.0, -0.5])
+def test_targets_stay_in_the_joint_ranges_if_they_are_to():
+    assert limited([3.0, -0.7], [2.0, -0.5], [0.0, 0.0], target_margin=0.0) == pytest.approx([2.0, -0.5])
     assert limited([3.0, -0.7], [1.9, -0.5], [0.0, 0.0], target_margin=0.1) == pytest.approx([1.9, -0.4])
 
 
 def test_targets_ask_for_no_more_than_the_motors_have():
     # 100 * 0.5 - 2 * 1 = 48 N m wanted of 20: q + (20 + 2) / 100; the knee's 50 * -0.1 + 1 * 4 = -1 N m is allowed
     assert limited([0.5, -0.1], [0.0, 0.0], [1.0, -4.0]) == pytest.approx([0.22, -0.1])
+    # beyond the range of 2 rad at its end: as far as the motor can push
+    assert limited([3.0, -0.1], [2.0, 0.0], [0.0, 0.0]) == pytest.approx([2.2, -0.1])
     assert limited([0.5, -0.1], [0.0, 0.0], [1.0, -4.0], effort=0.5) == pytest.approx([0.12, -0.1])
     assert limited([0.5, -0.1], [0.0, 0.0], [1.0, -4.0], effort=0.0) == pytest.approx([0.5, -0.1])
 
