@@ -140,6 +140,7 @@ def test_continues_from_the_end_of_the_rollout_under_way(ray_run: RayRun) -> Non
     assert not torch.equal(one["next", "policy"], last["next", "policy"])
 
 
+@pytest.mark.slow
 def test_adaptive_starts_count_the_failures_in_workers(ray_run: RayRun) -> None:
     batches, _, state = ray_run
     batches = batches[:3]

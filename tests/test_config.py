@@ -424,6 +424,7 @@ def make_default() -> TransformedEnv:
 
 
 class TestInTorchRL:
+    @pytest.mark.slow
     def test_serial(self):
         env = SerialEnv(2, make_default)
         rollout = env.rollout(3, break_when_any_done=False)

@@ -108,7 +108,13 @@ def task_of(monkeypatch: pytest.MonkeyPatch):
     return make_task
 
 
-@pytest.mark.parametrize("name", task_files())
+# one of each kind; the others take the same paths
+QUICK = ("lift_box", "walk", "push_box", "open_foldchair_sit", "truman_bow")
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in task_files()]
+)
 def test_graph_gives_the_trainers_targets(name: str, task_of):
     """On every task, with untrained weights, from the middle of the motion, where contact may be labelled."""
     cfg = load_config(f"task={name}")

@@ -346,6 +346,7 @@ def test_an_agent_is_evaluated_without_a_checkpoint(tmp_path: Path, capsys: pyte
     assert figures["body_error"]["mean"] < 0.1
 
 
+@pytest.mark.slow
 def test_an_agent_is_as_wide_as_the_environments_actions():
     """Whether there is a history of actions, and whatever that says."""
     nodes = ["action.history=null", "observation.policy.actions=null", "reward.action_rate=null"]
@@ -403,6 +404,7 @@ def test_an_exported_policy_acts_like_its_checkpoint(
     assert command("export").main([f"checkpoint={run}", f"out={out}", "num_envs=2"]) == 0
     assert {path.name for path in out.iterdir()} == {
         "policy.pt", "policy.onnx", "scene.xml", "reference.npz", "config.yaml", "eval.json", "video.mp4", "README.md",
+        "policy.yaml", "network.onnx", "motion",
     }  # fmt: skip
     original, exported = (load_policy(path)[0] for path in (run, out))
     assert original.state_dict().keys() == exported.state_dict().keys()

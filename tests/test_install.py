@@ -110,6 +110,7 @@ class TestWheel:
         assert wrong.stderr.startswith("there is no verb 'trian' (did you mean train?)")
         assert wrong.stderr.count("\n") == 1
 
+    @pytest.mark.slow
     def test_tasks_with_those_of_a_package(self, installed: Path, elsewhere: Path, own_package: Callable[..., Path]):
         kitchen = own_package().parents[1]
         listed = hdmi(installed, kitchen, arguments=["tasks"], cwd=elsewhere)
@@ -118,6 +119,7 @@ class TestWheel:
         assert "stir" in listed.stdout
         assert "cannot be used" not in listed.stdout
 
+    @pytest.mark.slow
     def test_training(self, installed: Path, elsewhere: Path):
         done = hdmi(installed, arguments=["train", *TINY], cwd=elsewhere)
         assert done.returncode == 0, done.stdout + done.stderr

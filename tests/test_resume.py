@@ -103,9 +103,9 @@ class TestContinuation:
     @pytest.mark.parametrize(
         "overrides",
         [
-            ["seed=3"],
+            pytest.param(["seed=3"], marks=pytest.mark.slow),
             pytest.param(["seed=1", "+ablation=no_randomization"], marks=pytest.mark.slow),
-            ["seed=2", "+ablation=no_interaction_reward_no_contact_termination"],
+            pytest.param(["seed=2", "+ablation=no_interaction_reward_no_contact_termination"], marks=pytest.mark.slow),
             ["reset=adaptive", "+lever=[springs,springs_object,rewind]", "seed=5"],
         ],
         ids=lambda overrides: overrides[-1],
@@ -141,6 +141,7 @@ class TestContinuation:
         torch.testing.assert_close(rows[0], rows[1], rtol=0, atol=0)
         assert len(rows[0].unique(dim=0)) == 4
 
+    @pytest.mark.slow
     def test_from_an_older_checkpoint_leaves_one_history(self, run: Path, tmp_path: Path) -> None:
         folder = tmp_path / "run"
         shutil.copytree(run, folder)
@@ -374,6 +375,7 @@ class TestWandb:
     def offline(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("WANDB_MODE", "offline")
 
+    @pytest.mark.slow
     def test_a_run_and_its_continuation_are_one_with_the_last_evaluation_and_the_video(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

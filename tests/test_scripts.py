@@ -77,6 +77,7 @@ def test_slurm_launcher_is_submitit_s() -> None:
     assert cfg.hydra.launcher.cpus_per_task == 16
 
 
+@pytest.mark.slow
 def test_author_writes_a_motion_that_its_task_takes(tmp_path: Path) -> None:
     from hdmi.motion import load_motion
 

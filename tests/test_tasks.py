@@ -396,6 +396,7 @@ class TestCheck:
 
     COMMAND = (sys.executable, str(ROOT / "scripts" / "tasks.py"))
 
+    @pytest.mark.slow
     def test_script(self):
         result = subprocess.run([*self.COMMAND, "check", "lift_box", "frames=0"], capture_output=True, text=True)
         assert result.returncode == 0, result.stderr

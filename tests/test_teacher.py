@@ -92,7 +92,10 @@ def test_continues_exactly_across_the_change_of_roles(tmp_path: Path) -> None:
     again = TeacherStudentTrainer(config(*ALGO, f"resume={tmp_path / 'run'}"), tmp_path / "run")
     assert again.iteration == 3
     assert bool(again.roles.student_acts)
-    again.collector.shutdown()
+    again.run()
+    assert again.iteration == straight.iteration == 4
+    for a, b in zip(parameters(straight), parameters(again), strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
 
 
 def test_what_leaves_is_the_student(tmp_path: Path) -> None:
