@@ -183,6 +183,7 @@ class TestLevers:
     def test_a_privileged_policy_sees_what_the_critic_sees(self):
         assert load_config("+lever=privileged").input.policy.groups == load_config().input.critic.groups
 
+    @pytest.mark.slow
     def test_steps_with_all_that_go_together(self):
         together = ",".join(name for name in LEVERS if name != "privileged")
         env = env_of(f"+lever=[{together}]", "num_envs=2", "total_frames=20")
