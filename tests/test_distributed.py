@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 from test_training import ROOT, config
 
-from hdmi.learning import CheckpointError, RunningNorm, Trainer, load_checkpoint
+from hdmi.learning import CheckpointError, RunningNorm, Trainer, load_checkpoint, make_trainer
 from hdmi.learning.distributed import Ranks
 
 pytestmark = pytest.mark.xdist_group("ranks")  # its runs are made once, not in each process
@@ -49,7 +49,11 @@ def work(folder: Path) -> None:
     trainer = Trainer(config(f"resume={folder / 'half'}"), folder / "half")
     trainer.run()
     resumed = {"weights": weights(trainer), "qpos": trainer.env.base_env.get_state()["backend", "data/qpos"]}
-    torch.save({"stepped": stepped, "run": run, "resumed": resumed}, folder / f"rank{rank}.pt")
+
+    trainer = make_trainer(config("algo=teacher_student", "algo.teacher_share=0.5"), folder / "taught")
+    trainer.run()
+    taught = {"weights": weights(trainer)}
+    torch.save({"stepped": stepped, "run": run, "resumed": resumed, "taught": taught}, folder / f"rank{rank}.pt")
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +84,13 @@ def test_ranks_start_and_stay_equal(ranks: tuple[Path, Trainer, list[dict]]) -> 
     assert parameters
     assert all(torch.equal(first["stepped"]["start"][n], second["stepped"]["start"][n]) for n in parameters)
     assert not torch.equal(first["run"]["qpos"], second["run"]["qpos"])  # other worlds, other noise
+
+
+def test_teacher_and_student_stay_equal(ranks: tuple[Path, Trainer, list[dict]]) -> None:
+    first, second = (rank["taught"]["weights"] for rank in ranks[2])
+    assert first["actor.student_acts"]
+    for name, value in first.items():
+        assert torch.equal(value, second[name]), name
 
 
 def test_learn_what_one_process_learns_from_the_union(ranks: tuple[Path, Trainer, list[dict]]) -> None:

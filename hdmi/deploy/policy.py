@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -136,21 +136,35 @@ class Policy:
             SensorError: if one is missing, unknown, of a wrong shape or not finite.
             OutputError: if the result is not finite; the state stays as it was.
         """
-        if unknown := [name for name in sensors if name not in self.description.sensors]:
-            raise SensorError(f"unknown sensors {', '.join(unknown)}; there is {', '.join(self.description.sensors)}")
-        if missing := [name for name in self.sensors if name not in sensors]:
-            raise SensorError(f"sensors {', '.join(missing)} are missing; the policy needs {', '.join(self.sensors)}")
-        feed = {name: np.asarray(sensors[name], dtype=np.float32) for name in self.sensors}
-        for name, value in feed.items():
-            if value.shape != self.description.sensors[name]:
-                raise SensorError(
-                    f"{name}: expected shape {list(self.description.sensors[name])}, got {list(value.shape)}"
-                )
-            if not np.isfinite(value).all():
-                raise SensorError(f"{name}: is not finite: {value.tolist()}")
+        feed = checked_sensors(sensors, self.sensors, self.description.sensors, np.float32)
         target, *after = self._session.run(self._outputs, feed | self.state)
         if not np.isfinite(target).all():
             raise OutputError(f"{TARGET} is not finite at frame {self.frame + 1}")
         self.state = dict(zip(self._initial, after, strict=True))
         self.frame = min(self.frame + 1, self.description.num_frames - 1)
         return target
+
+
+def checked_sensors(
+    sensors: Mapping[str, np.ndarray], needed: Sequence[str], shapes: Mapping[str, tuple[int, ...]], dtype: type
+) -> dict[str, np.ndarray]:
+    """The sensors that a policy needs, as arrays of a dtype.
+
+    Args:
+        sensors: what was measured, by name.
+        shapes: of all sensors that there are.
+
+    Raises:
+        SensorError: if one is missing, unknown, of a wrong shape or not finite.
+    """
+    if unknown := [name for name in sensors if name not in shapes]:
+        raise SensorError(f"unknown sensors {', '.join(unknown)}; there is {', '.join(shapes)}")
+    if missing := [name for name in needed if name not in sensors]:
+        raise SensorError(f"sensors {', '.join(missing)} are missing; the policy needs {', '.join(needed)}")
+    found: dict[str, np.ndarray] = {name: np.asarray(sensors[name], dtype=dtype) for name in needed}
+    for name, value in found.items():
+        if value.shape != shapes[name]:
+            raise SensorError(f"{name}: expected shape {list(shapes[name])}, got {list(value.shape)}")
+        if not np.isfinite(value).all():
+            raise SensorError(f"{name}: is not finite: {value.tolist()}")
+    return found

@@ -93,7 +93,13 @@ class TeacherOrStudent(TensorDictModuleBase):
 
 
 class _Lesson(torch.nn.Module):
-    """PPO's loss of whoever acted, and how far the student is from the teacher."""
+    """PPO's loss of whoever acted, and how far the student is from the teacher.
+
+    Attributes:
+        in_turns: some parameters have no part in a loss: the teacher's while the student acts.
+    """
+
+    in_turns = True
 
     def __init__(
         self,

@@ -527,7 +527,10 @@ class Objective(torch.nn.Module):
 
 def _parallel(objective: torch.nn.Module) -> DistributedDataParallel:
     # running moments are averaged where they are updated; gradients need not be copied to be reduced
-    return DistributedDataParallel(objective, broadcast_buffers=False, gradient_as_bucket_view=True)
+    return DistributedDataParallel(
+        objective, broadcast_buffers=False, gradient_as_bucket_view=True,
+        find_unused_parameters=getattr(objective, "in_turns", False),
+    )  # fmt: skip
 
 
 def _digest(motion: Path) -> str:

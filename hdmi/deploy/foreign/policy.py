@@ -15,7 +15,7 @@ from hdmi.deploy.foreign.motion import Motion, motion_of, read_motion
 from hdmi.deploy.foreign.schema import NETWORK, NetworkSpec, per_joint, read_spec
 from hdmi.deploy.foreign.stack import Graph, Stack
 from hdmi.deploy.foreign.terms import Moment, sensors_of
-from hdmi.deploy.policy import OutputError, SensorError
+from hdmi.deploy.policy import OutputError, checked_sensors
 from hdmi.deploy.rotations import quat_apply_inverse, tilt_of
 
 MAX_FRAMES = 100_000  # of a motion that a network gives itself
@@ -96,17 +96,7 @@ class ForeignPolicy:
             SensorError: if one is missing, unknown, of a wrong shape or not finite.
             OutputError: if the result is not finite; the state stays as it was.
         """
-        shapes = self.description.sensors
-        if unknown := [name for name in sensors if name not in shapes]:
-            raise SensorError(f"unknown sensors {', '.join(unknown)}; there is {', '.join(shapes)}")
-        if missing := [name for name in self.sensors if name not in sensors]:
-            raise SensorError(f"sensors {', '.join(missing)} are missing; the policy needs {', '.join(self.sensors)}")
-        given = {name: np.asarray(sensors[name], dtype=float) for name in self.sensors}
-        for name, value in given.items():
-            if value.shape != shapes[name]:
-                raise SensorError(f"{name}: expected shape {list(shapes[name])}, got {list(value.shape)}")
-            if not np.isfinite(value).all():
-                raise SensorError(f"{name}: is not finite: {value.tolist()}")
+        given = checked_sensors(sensors, self.sensors, self.description.sensors, float)
         frame = min(self.frame + 1, self.motion.num_frames - 1)
         before = self.stack.memory
         target = self.stack(self._moment(given, frame), np.array(self._fresh)).astype(np.float32)
