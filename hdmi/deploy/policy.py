@@ -51,16 +51,7 @@ class Policy:
         where, content = str(path), path.read_bytes()
         self.path = path
         self.digest = hashlib.sha256(content).hexdigest()
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-        options.log_severity_level = 3
-        try:
-            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # its errors have no common class
-            raise PolicyError(
-                f"{where}: is no ONNX graph that ONNX Runtime reads: {str(error).splitlines()[0]}"
-            ) from error
+        self._session = open_graph(content, where)
         metadata = self._session.get_modelmeta().custom_metadata_map
         self.description: Description = read_description(metadata, where)
         inputs = {value.name: value for value in self._session.get_inputs()}
@@ -143,6 +134,26 @@ class Policy:
         self.state = dict(zip(self._initial, after, strict=True))
         self.frame = min(self.frame + 1, self.description.num_frames - 1)
         return target
+
+
+def open_graph(content: bytes, where: str) -> onnxruntime.InferenceSession:
+    """A graph in ONNX Runtime, on one thread of the CPU.
+
+    Args:
+        where: the file, for messages.
+
+    Raises:
+        PolicyError: if it is none.
+    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its errors have no common class
+        reason = str(error).splitlines()[0]
+        raise PolicyError(f"{where}: is no ONNX graph that ONNX Runtime reads: {reason}") from error
 
 
 def checked_sensors(

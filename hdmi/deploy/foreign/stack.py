@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 
 from hdmi.deploy.description import PolicyError
 from hdmi.deploy.foreign.motion import Motion
 from hdmi.deploy.foreign.schema import NetworkSpec, one_of, per_joint
 from hdmi.deploy.foreign.terms import TERMS, Bound, Moment, bind
+from hdmi.deploy.policy import open_graph
 
 _DTYPES = {
     "tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(int64)": np.int64, "tensor(int32)": np.int32,
@@ -40,14 +40,7 @@ class Graph:
         if not self.path.is_file():
             raise PolicyError(f"{path}: there is no such file")
         self.content = self.path.read_bytes()
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 3
-        try:
-            self._session = onnxruntime.InferenceSession(self.content, options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # its errors have no common class
-            reason = str(error).splitlines()[0]
-            raise PolicyError(f"{path}: is no ONNX graph that ONNX Runtime reads: {reason}") from error
+        self._session = open_graph(self.content, str(path))
         self.metadata: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
         self.inputs: dict[str, list[Any]] = {value.name: value.shape for value in self._session.get_inputs()}
         self.outputs: dict[str, list[Any]] = {value.name: value.shape for value in self._session.get_outputs()}
