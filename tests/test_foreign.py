@@ -286,6 +286,17 @@ def test_targets_from_the_action(tmp_path: Path):
     assert policy.stack.last_action(np.array(False)) == pytest.approx([0.05])
 
 
+def test_targets_from_the_motion_s_own(tmp_path: Path):
+    action = {"base": "joint_target", "scale": 2.0}
+    with pytest.raises(PolicyError, match="has no joint_target, which the policy's actions start from"):
+        make_policy(tmp_path, [{"term": "joint_pos"}], np.eye(2), action=action)
+    ahead = motion_arrays()["joint_pos"] + 0.3
+    np.savez(tmp_path / "motion" / "motion.npz", **motion_arrays(), joint_target=ahead)
+    policy = ForeignPolicy(tmp_path / "policy.yaml")
+    policy.reset(10)
+    assert policy(sensors()) == pytest.approx([0.01 + 0.3 + 2.0 * 0.1, 0.02 + 0.3 + 2.0 * 0.2])
+
+
 def test_the_clock_ends_with_the_motion(tmp_path: Path):
     policy = make_policy(tmp_path, [{"term": "step"}], np.ones((1, 2)))
     steps = [value[0] for value in seen(policy, *[sensors()] * (FRAMES + 2))]
@@ -634,7 +645,7 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, Any, Any]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hdmi.assembly.start_tables", lambda *_: None)  # they take seconds
-        cfg = load_config("task=lift_box")
+        cfg = load_config("task=lift_box", "+lever=feedforward")
         with open_dict(cfg):
             cfg.randomization = cfg.noise = None
             cfg.action.delay = cfg.action.smoothing = None

@@ -37,6 +37,7 @@ class Motion:
     object_joint_pos: np.ndarray  # [T, K]
     contact: np.ndarray  # [T, E], 0 or 1
     contact_points: np.ndarray  # [T, E, 3], in the frame of the object's link
+    joint_target: np.ndarray  # [T, J], where servos are to be sent; width 0 if the motion does not say so
 
     @property
     def num_frames(self) -> int:
@@ -82,7 +83,7 @@ def read_motion(folder: str | Path, spec: NetworkSpec, kinematics: Kinematics) -
         )
     try:
         with np.load(path, allow_pickle=False) as file:
-            kept = (*_NEEDED, "joint_vel", "object_contact", "contact_points")
+            kept = (*_NEEDED, "joint_vel", "joint_target", "object_contact", "contact_points")
             arrays = {name: np.asarray(file[name], dtype=float) for name in kept if name in file.files}
     except Exception as error:  # zipfile's, too
         raise PolicyError(f"{path}: cannot be read: {str(error).splitlines()[0]}") from error
@@ -102,7 +103,7 @@ def motion_of(
 
     Args:
         arrays: `joint_pos` [T, *], `body_pos_w` [T, *, 3], `body_quat_w` [T, *, 4]; if there are any `joint_vel`,
-            `object_contact` [T, E] or [T], `contact_points` [T, E, 3].
+            `joint_target` [T, *], `object_contact` [T, E] or [T], `contact_points` [T, E, 3].
         joint_names, body_names: of these.
 
     Raises:
@@ -112,7 +113,7 @@ def motion_of(
         raise PolicyError(f"{where}: lacks {', '.join(missing)}")
     frames, dt = len(arrays["joint_pos"]), spec.control_dt
     shapes = {
-        "joint_pos": (frames, len(joint_names)), "joint_vel": (frames, len(joint_names)),
+        **dict.fromkeys(("joint_pos", "joint_vel", "joint_target"), (frames, len(joint_names))),
         "body_pos_w": (frames, len(body_names), 3), "body_quat_w": (frames, len(body_names), 4),
     }  # fmt: skip
     for key, shape in shapes.items():
@@ -132,6 +133,12 @@ def motion_of(
     pos[:, rows] = arrays["joint_pos"][:, columns]
     vel = np.zeros_like(pos)
     vel[:, rows] = arrays["joint_vel"][:, columns] if "joint_vel" in arrays else _rate(pos, dt)[:, rows]
+    target = np.zeros((frames, 0))
+    if "joint_target" in arrays:
+        target = pos.copy()
+        target[:, rows] = arrays["joint_target"][:, columns]
+    elif spec.action.base == "joint_target":
+        raise PolicyError(f"{where}: has no joint_target, which the policy's actions start from")
     quats = arrays["body_quat_w"]
     if (np.abs(np.linalg.norm(quats, axis=-1) - 1.0) > 0.05).any():
         raise PolicyError(f"{where}: body_quat_w: expected quaternions wxyz of length 1")
@@ -163,6 +170,7 @@ def motion_of(
         object_joint_pos=arrays["joint_pos"][:, hinge],
         contact=labels,
         contact_points=points,
+        joint_target=target,
         **thing,
     )
 

@@ -24,6 +24,7 @@ from hdmi.transforms import (
     ActionHistory,
     Concatenate,
     DefaultPoseAction,
+    FeedForwardTarget,
     History,
     JointPositionAction,
     MotionReference,
@@ -65,7 +66,7 @@ def write_own(graph: PolicyGraph, task: Task, trial: Mapping[str, Any], folder: 
     """
     folder, scene, robot = Path(folder), task.scene, task.scene.robot
     terms, action, hinge = own_terms(graph, task), own_action(graph, task), _hinge_name(task.scene)
-    save_motion(_motion(task), folder / MOTION_FOLDER)
+    save_motion(_motion(task, _joint_target(graph)), folder / MOTION_FOLDER)
     model = network_to_onnx(graph.network, len(graph.network.norm.mean))
     (folder / NETWORK_FILE).write_bytes(model.SerializeToString())
     lists = ("stiffness", "damping", "default_joint_pos", "effort_limits", "velocity_limits")
@@ -125,13 +126,16 @@ def own_action(graph: PolicyGraph, task: Task) -> dict[str, Any]:
         DeploymentError: for a transform of actions that has no equivalent; names it.
     """
     found: dict[str, Any] = {}
+    bases: dict[NestedKey, str] = {("ref", "joint_pos"): "reference"}
+    if _joint_target(graph) is not None:
+        bases["ref", "joint_target"] = "joint_target"
     names = task.scene.robot.joint_names
     for name, transform in graph.inverse:
         if isinstance(transform, JointPositionAction):
             joints = [names[i] for i in transform.index.tolist()]
             found |= {"scale": dict(zip(joints, transform.scale.tolist(), strict=True)), "joints": joints}
-        elif isinstance(transform, ResidualAction) and unravel_key(transform.state_keys[0]) == ("ref", "joint_pos"):
-            found["base"] = "reference"
+        elif isinstance(transform, ResidualAction) and unravel_key(transform.state_keys[0]) in bases:
+            found["base"] = bases[unravel_key(transform.state_keys[0])]
         elif isinstance(transform, DefaultPoseAction):
             found["base"] = "default"
         else:
@@ -141,8 +145,13 @@ def own_action(graph: PolicyGraph, task: Task) -> dict[str, Any]:
     return found
 
 
-def _motion(task: Task) -> Motion:
-    """The reference as a motion of robot and object."""
+def _joint_target(graph: PolicyGraph) -> Tensor | None:
+    """Where the policy's servos are sent along the reference, rad. [T, J]"""
+    return next((t.targets for _, t in graph.stages if isinstance(t, FeedForwardTarget)), None)
+
+
+def _motion(task: Task, joint_target: Tensor | None = None) -> Motion:
+    """The reference as a motion of robot and object; the object's hinge has no servo, and its target is where it is."""
     r, scene = task.reference, task.scene
     names, hinge = [*scene.robot.body_names], _hinge_name(scene)
     bodies = {
@@ -162,6 +171,7 @@ def _motion(task: Task) -> Motion:
         joint_names=(*scene.robot.joint_names, *hinge),
         joint_pos=torch.cat([r.joint_pos, r.object_joint_pos], dim=-1).numpy(),
         joint_vel=torch.cat([r.joint_vel, r.object_joint_vel], dim=-1).numpy(),
+        joint_target=None if joint_target is None else torch.cat([joint_target, r.object_joint_pos], dim=-1).numpy(),
         object_contact=r.contact.numpy() if labelled else None,
         contact_points=r.contact_point.numpy() if labelled else None,
         **{key: torch.cat(parts, dim=1).numpy() for key, parts in bodies.items()},

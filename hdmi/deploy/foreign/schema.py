@@ -109,7 +109,8 @@ class Action:
     """From the network's output to joint position targets: base + scale * output, rad.
 
     Args:
-        base: `reference`: the motion's present joint positions, or `default`: the default pose.
+        base: `reference`: the motion's present joint positions, `joint_target`: its present joint targets, or `default`:
+            the default pose.
         scale: rad per unit.
         joints: that the network drives, in its order; all if empty. The others follow the base.
         output: its name; the first if empty.
@@ -123,7 +124,7 @@ class Action:
     clip: float = math.inf
 
     def check(self, where: str) -> None:
-        one_of(self.base, ("reference", "default"), f"{where}.base")
+        one_of(self.base, ("reference", "joint_target", "default"), f"{where}.base")
 
 
 @dataclass(frozen=True)

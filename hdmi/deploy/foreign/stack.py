@@ -191,8 +191,9 @@ class Stack:
 
     def base(self, step: np.ndarray) -> np.ndarray:
         """What the action is added to, rad. int [...] -> [..., J]"""
-        if self.spec.action.base == "reference":
-            return self.motion.joint_pos[np.clip(step, 0, self.motion.num_frames - 1)]
+        along = {"reference": self.motion.joint_pos, "joint_target": self.motion.joint_target}
+        if self.spec.action.base in along:
+            return along[self.spec.action.base][np.clip(step, 0, self.motion.num_frames - 1)]
         return np.broadcast_to(self.default_pose, (*step.shape, len(self.default_pose)))
 
     def __call__(self, now: Moment, fresh: np.ndarray) -> np.ndarray:
