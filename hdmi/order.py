@@ -26,6 +26,7 @@ from hdmi.transforms import (
     MotionEnd,
     ObjectScale,
     ReferenceStateInitialization,
+    ResetNoiseCurriculum,
     ResidualAction,
     RewardRate,
     RewardTerm,
@@ -164,6 +165,11 @@ RULES: tuple[Rule, ...] = (
         _is(ReferenceStateInitialization),
         _is(Rewind),
         "resets go through the stack from last to first, and starts have to know the frame that is chosen",
+    ),
+    Before(
+        _is(ReferenceStateInitialization),
+        _is(ResetNoiseCurriculum),
+        "resets go through the stack from last to first, and starts have to know how much they are perturbed",
     ),
     Before(
         _drawn_per("episode"),

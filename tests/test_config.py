@@ -149,6 +149,7 @@ LEVERS = sorted(path.stem for path in (CONF / "lever").glob("*.yaml"))
 CHANGED_BY_LEVER: dict[str, tuple[set[str], set[str], set[str]]] = {
     "early_end": ({"early_end.early_root_pose", "early_end.early_body_pose"}, set(), set()),
     "feedforward": ({"reference.target"}, set(), {"action.target"}),
+    "noise_curriculum": ({"reset.curriculum"}, set(), set()),
     "privileged": (
         set(),
         {f"noise.{name}" for name in ("root_ang_vel", "gravity", "joint_pos", "object_position", "object_heading")}

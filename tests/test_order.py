@@ -55,6 +55,7 @@ WRONG: dict[str, tuple[Transform, Transform, str]] = {
     "size": (T.ObjectScale([0.9, 1.1]), starts(), "starts have to know the size"),
     "adaptive": (T.ObjectScale([0.9, 1.1]), starts(adaptive=True), "starts have to know the size"),
     "rewind": (T.Rewind(), starts(), "starts have to know the frame"),
+    "curriculum": (T.ResetNoiseCurriculum(20), starts(), "how much they are perturbed"),
     "worlds": (mass("box", "world"), mass("pelvis", "episode"), "untouched model"),
     "delay": (T.ActionSmoothing(), T.ActionDelay([1, 2], 4), "the last thing that happens to a target"),
     "late offsets": (T.ResidualAction(), T.ActionDelay([1, 2], 4), "targets that are delayed"),

@@ -227,6 +227,7 @@ CASES: dict[str, Case] = {
         lambda r, **k: T.RelativeJointPos(r("out"), default_joint_pos(), **k), "function", (("robot", "joint_pos"),)
     ),
     "ResidualAction": Case(lambda r, **k: T.ResidualAction(**k), "inverse", (("ref", "joint_pos"),)),
+    "ResetNoiseCurriculum": Case(lambda r, **k: T.ResetNoiseCurriculum(20, **k), "init"),
     "Rewind": Case(lambda r, **k: T.Rewind(**k), "init", (("ref", "step"),), random=True),
     "RewardRate": Case(lambda r, **k: T.RewardRate(0.02, **k), "reward"),
     "SpringAssist": Case(spring, "inverse", (("ref", "step"), *MOVING_ROOT)),

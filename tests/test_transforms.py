@@ -295,6 +295,33 @@ class TestRewind:
         close(after["ref", "joint_pos"], reference.joint_pos[frames])
 
 
+class TestResetNoiseCurriculum:
+    def env(self, reference, **kwargs) -> ResetEnv:
+        clock = T.MotionReference(reference, ["pelvis"], ["waist_.*"], g1.BODY_NAMES, g1.JOINT_NAMES)
+        start = T.ReferenceStateInitialization(reference, g1.JOINT_RANGES, start=20, noise={"root_lin_vel": 2.0})
+        base = HumanoidObjectEnv(lift_box().scene, 50, lambda m, n: BatchBackend(m, n, 1))
+        return RowResetEnv(
+            base, Compose(start, T.ResetNoiseCurriculum(**kwargs), clock), max_penetration=1.0, redraws=1
+        )
+
+    def test_perturbations_grow_with_the_steps(self, reference):
+        env = self.env(reference, total_steps=8, start=0.25, grow=0.5)
+        largest = []
+        for _ in range(6):
+            td = env.reset()
+            largest.append(float((td["robot", "root_lin_vel"] - reference.body_lin_vel[20, 0]).abs().max()))
+            env.step(td.set("action", td["robot", "joint_pos"]))
+        close(torch.tensor(largest), 2.0 * torch.tensor([0.25, 0.4375, 0.625, 0.8125, 1.0, 1.0]), 0.1)
+
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [({"start": 1.5}, "start: expected a share from 0"), ({"grow": 0.0}, "grow: expected a share of")],
+    )
+    def test_bad_shares(self, given, message):
+        with pytest.raises(ValueError, match=message):
+            T.ResetNoiseCurriculum(10, **given)
+
+
 class TestMotionEnd:
     def test_truncates_at_the_last_frame(self):
         steps = torch.tensor([0, 1, 2, 3, 3]).reshape(-1, 1, 1)

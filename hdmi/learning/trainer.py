@@ -132,7 +132,9 @@ class Trainer:
         self.averaged = AveragedModel(self.policy, avg_fn=partial(_recent_mean, share=algo.average))
         objective = self._objective()
         self.objective = objective if self.ranks.size == 1 else _parallel(objective)
-        self.gae = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=None)
+        self.gae, self.returns = (
+            GAE(gamma=algo.gamma, lmbda=lmbda, value_network=None) for lmbda in (algo.lmbda, algo.critic_lmbda)
+        )
         self.actor_optim = torch.optim.Adam(self.actor.parameters(), lr=algo.actor_lr, fused=True)
         self.critic_optim = torch.optim.Adam(self.critic.parameters(), lr=algo.critic_lr, fused=True)
         self.schedule = KLAdaptiveLR(
@@ -201,8 +203,8 @@ class Trainer:
                 `action_log_prob`, and of `next` `critic`, `reward`, `done`, `terminated`.
 
         Returns:
-            Batch [N T]: `policy` and `critic` normalised, `action`, `action_log_prob`, and by GAE `state_value`,
-            `advantage`, `value_target` [N T, 1].
+            Batch [N T]: `policy` and `critic` normalised, `action`, `action_log_prob`, `state_value`, and by GAE
+            `advantage` with `algo.lmbda` and `value_target` with `algo.critic_lmbda`, [N T, 1].
         """
         data = batch.select(*_COLLECTED_KEYS)
         for key, network in (("policy", self.policy), ("critic", self.critic)):
@@ -214,7 +216,8 @@ class Trainer:
         following = value.roll(-1, dims=1)
         following[last] = self.critic(batch["next"].select("critic")[last])["state_value"]
         data.set(("next", "state_value"), following)
-        return self.gae(data).exclude("next").reshape(-1)
+        target = self.returns(data.copy())["value_target"]
+        return self.gae(data).exclude("next").set("value_target", target).reshape(-1)
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """One PPO update on a batch [N, T]; returns losses and statistics."""

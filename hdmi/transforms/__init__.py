@@ -52,6 +52,7 @@ from hdmi.transforms.reference import (
     MotionEnd,
     MotionReference,
     ReferenceStateInitialization,
+    ResetNoiseCurriculum,
     Rewind,
 )
 from hdmi.transforms.reward import (
@@ -141,6 +142,7 @@ __all__ = [
     "RandomPush",
     "ReferenceStateInitialization",
     "RelativeJointPos",
+    "ResetNoiseCurriculum",
     "ResidualAction",
     "RewardRate",
     "RewardTerm",

@@ -385,6 +385,59 @@ class Rewind(SpecTransform):
         return tensordict.set(self.out_key, torch.where(chosen, (step - back).clamp(min=0), -1))
 
 
+class ResetNoiseCurriculum(SpecTransform):
+    """Starts episodes with a share of the perturbations that grows while training goes on.
+
+    The share rises linearly with the steps taken, from `start` to 1; their count is a buffer that goes with the
+    transform's state. Reads on reset, where it is, and writes `noise_share_key` [N, 1], which
+    `ReferenceStateInitialization` reads: what was asked for, times the share. It has no effect between resets.
+
+    Args:
+        total_steps: of the training, for each environment.
+        start: share at first.
+        grow: share of `total_steps` after which perturbations are whole.
+
+    Examples:
+        >>> curriculum = ResetNoiseCurriculum(total_steps=100, start=0.2, grow=0.5)
+        >>> asked = TensorDict({"init": {"noise_share": torch.tensor([[1.0], [0.5]])}}, [2])
+        >>> curriculum._reset_env_preprocess(asked)["init", "noise_share"].flatten()
+        tensor([0.2000, 0.1000])
+    """
+
+    training_only = True
+
+    def __init__(
+        self, total_steps: int, start: float = 0.3, grow: float = 0.5, noise_share_key: NestedKey = NOISE_SHARE_KEY
+    ):
+        super().__init__()
+        if not 0 <= start <= 1:
+            raise ValueError(f"reset: curriculum: start: expected a share from 0 to 1, got {start}")
+        if not 0 < grow <= 1:
+            raise ValueError(
+                f"reset: curriculum: grow: expected a share of the training, above 0 and up to 1, got {grow}"
+            )
+        self.start, self.grow_steps = start, max(grow * total_steps, 1.0)
+        self.noise_share_key = key_of(noise_share_key)
+        self.register_buffer("steps", torch.zeros(()))
+
+    @property
+    def share(self) -> Tensor:
+        """Of the perturbations, from `start` to 1."""
+        return self.start + (1 - self.start) * (self.steps / self.grow_steps).clamp(max=1)
+
+    def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
+        if tensordict is None:
+            tensordict = TensorDict({}, batch_size=self.parent.batch_size, device=self.parent.device)
+        asked = tensordict.get(self.noise_share_key, None)
+        if asked is None:
+            asked = torch.ones(*tensordict.batch_size, 1, device=tensordict.device)
+        return tensordict.set(self.noise_share_key, asked * self.share)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self.steps.add_(1)
+        return next_tensordict
+
+
 class AdaptiveStateInitialization(ReferenceStateInitialization):
     """Reference state initialization that starts more often shortly before frames where episodes fail.
 
