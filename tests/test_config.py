@@ -40,8 +40,8 @@ EXPECTED: dict[str, tuple[set[str], set[str]]] = {
         | {"noise.contact_points", "noise.contact_points_episode"},
         set(),
     ),
-    "no_residual": (set(), {"action.target"}),
-    "no_residual_no_body_termination": ({"termination.body_local_pose"}, {"action.target"}),
+    "no_residual": ({"action.target"}, set()),
+    "no_residual_no_body_termination": ({"action.target", "termination.body_local_pose"}, set()),
     "no_rsi": (set(), {"reset.state"}),
 }
 
@@ -109,14 +109,18 @@ class TestAblations:
         default, ablated = stack_of(), stack_of(f"+ablation={name}")
         gone, changed = EXPECTED[name]
         assert set(default) - set(ablated) == gone
-        assert set(ablated) <= set(default)
+        assert set(ablated) - set(default) == ({"action.default_pose"} if "action.target" in gone else set())
         # what remains keeps its place
-        assert list(ablated) == [node for node in default if node in ablated]
-        assert {node for node in ablated if ablated[node] != default[node]} == changed
+        kept = [node for node in default if node in ablated]
+        assert [node for node in ablated if node in default] == kept
+        assert {node for node in kept if ablated[node] != default[node]} == changed
 
     def test_what_they_change_to(self):
         assert stack_of()["action.target"].startswith("ResidualAction")
-        assert stack_of("+ablation=no_residual")["action.target"].startswith("DefaultPoseAction")
+        without = stack_of("+lever=feedforward", "+ablation=no_residual")
+        assert without["action.default_pose"].startswith("DefaultPoseAction")
+        place = [node.replace("default_pose", "target") for node in without if node.startswith("action.")]
+        assert place == [node for node in stack_of() if node.startswith("action.")]
         assert "'start': 'first'" in stack_of("+ablation=no_rsi")["reset.state"]
 
     @pytest.mark.parametrize("name", ["no_object_observation", "no_randomization"])
