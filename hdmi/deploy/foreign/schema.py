@@ -109,7 +109,7 @@ class Action:
     """From the network's output to joint position targets: base + scale * output, rad.
 
     Args:
-        base: `reference` or `joint_target`: the motion's present joint positions or targets; `default`: the default pose.
+        base: the motion's present joint positions, `reference`, or targets, `joint_target`; or the `default` pose.
         scale: rad per unit.
         joints: that the network drives, in its order; all if empty. The others follow the base.
         output: its name; the first if empty.
