@@ -54,7 +54,7 @@ def work(folder: Path) -> None:
     trainer.run()
     taught = {"weights": weights(trainer)}
 
-    trainer = Trainer(config("reward=hdmi_2025", "task.episode_steps=5"), folder / "grouped")
+    trainer = Trainer(config("reward=hdmi_2025", f"task.episode_steps={(5, 3)[rank]}"), folder / "grouped")
     counts, step = [], trainer._step
 
     def counted(minibatch: TensorDictBase) -> dict[str, float] | None:
@@ -83,7 +83,7 @@ def ranks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trainer, list
     alone.update(batch)
     alone.collector.shutdown()
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", __file__]
-    result = subprocess.run([*command, str(folder)], capture_output=True, text=True, cwd=ROOT / "tests", timeout=240)
+    result = subprocess.run([*command, str(folder)], capture_output=True, text=True, cwd=ROOT / "tests", timeout=300)
     assert result.returncode == 0, result.stderr[-3000:]
     return folder, alone, [torch.load(folder / f"rank{i}.pt", weights_only=True) for i in range(2)]
 
@@ -109,8 +109,8 @@ def test_teacher_and_student_stay_equal(ranks: tuple[Path, Trainer, list[dict]])
 def test_of_unequal_numbers_of_steps_they_learn_from_as_many(ranks: tuple[Path, Trainer, list[dict]]) -> None:
     """Without first steps, whose number differs, and with a value for each group of rewards."""
     first, second = (rank["grouped"] for rank in ranks[2])
-    assert first["counts"] == second["counts"]
-    assert len(set(first["counts"])) > 1  # fewer in iterations in which more episodes begin
+    # of 32 steps in an iteration, 8 are the first of an episode on one rank, 12 on the other: two minibatches of 20
+    assert first["counts"] == second["counts"] == [10] * 8
     for name, value in first["weights"].items():
         assert torch.equal(value, second["weights"][name]), name
     assert [float(x) for x in first["moments"]] == [float(x) for x in second["moments"]] == [3.0, 3.5]
