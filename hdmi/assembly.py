@@ -34,7 +34,7 @@ from hdmi.motion import Reference, find_motion, make_reference
 from hdmi.motion.dynamics import reference_torque
 from hdmi.motion.starts import StartTables, start_tables
 from hdmi.order import check_order, check_reads, listed_keys, read_keys
-from hdmi.transforms import KernelReward, KernelTermination
+from hdmi.transforms import KernelReward, KernelTermination, RewardTerm
 
 # What leaves the stack besides the state that steps read back.
 OUTPUTS = (
@@ -46,6 +46,7 @@ OUTPUTS = (
     "diverged",
     "episode_reward",
     "reward_terms",
+    "reward_groups",
     "step_count",
     "pixels",
 )
@@ -267,11 +268,15 @@ def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
     }
     stack: list[tuple[str, Transform]] = []
     written: dict[str, list[NestedKey]] = {}  # entry of the stack -> keys
+    term_weights: dict[NestedKey, float] = {}  # of the reward terms so far
+    so_far = {"written": written, "term_weights": term_weights}
     for entry in cfg.stack:
         keys: list[NestedKey] = []
         for where, node in _nodes(cfg, entry):
-            transform = build(node, where, name=where.rpartition(".")[2], written=written, **context)
+            transform = build(node, where, name=where.rpartition(".")[2], **so_far, **context)
             stack.append((where, transform))
+            if isinstance(transform, RewardTerm):
+                term_weights[transform.out_keys[0]] = transform.weight
             keys += listed_keys(transform, "out_keys") or ()
         written[entry] = keys
     check_order(stack)

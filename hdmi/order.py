@@ -28,6 +28,7 @@ from hdmi.transforms import (
     ReferenceStateInitialization,
     ResetNoiseCurriculum,
     ResidualAction,
+    RewardGroups,
     RewardRate,
     RewardTerm,
     Rewind,
@@ -190,6 +191,7 @@ RULES: tuple[Rule, ...] = (
     # steps
     Before(_is(TerminationTerm), _reads_terminated, "it reads `terminated`, which would not be complete"),
     Before(_is(RewardTerm), _is(RewardRate), "a term after it would count for as much as a second of the others"),
+    Before(_is(RewardTerm), _is(RewardGroups), "a term after it would be in no group"),
     Before(_is(RewardTerm, RewardRate), _is(RewardSum), "the return would be another than that of the reward"),
     Before(_NOISE, _is(History), "past observations would be perturbed anew in every step", _same_key),
     _noise_is_seen,

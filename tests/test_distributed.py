@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from test_training import ROOT, config
 
 from hdmi.learning import CheckpointError, RunningNorm, Trainer, load_checkpoint, make_trainer
@@ -53,7 +53,20 @@ def work(folder: Path) -> None:
     trainer = make_trainer(config("algo=teacher_student", "algo.teacher_share=0.5"), folder / "taught")
     trainer.run()
     taught = {"weights": weights(trainer)}
-    torch.save({"stepped": stepped, "run": run, "resumed": resumed, "taught": taught}, folder / f"rank{rank}.pt")
+
+    trainer = Trainer(config("reward=hdmi_2025", f"task.episode_steps={(5, 3)[rank]}"), folder / "grouped")
+    counts, step = [], trainer._step
+
+    def counted(minibatch: TensorDictBase) -> dict[str, float] | None:
+        counts.append(len(minibatch))
+        return step(minibatch)
+
+    trainer._step = counted
+    trainer.run()
+    moments = trainer.ranks.moments(torch.tensor(([1.0, 2.0, 3.0], [6.0])[rank]))
+    grouped = {"weights": weights(trainer), "moments": moments, "counts": counts}
+    results = {"stepped": stepped, "run": run, "resumed": resumed, "taught": taught, "grouped": grouped}
+    torch.save(results, folder / f"rank{rank}.pt")
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +83,7 @@ def ranks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trainer, list
     alone.update(batch)
     alone.collector.shutdown()
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", __file__]
-    result = subprocess.run([*command, str(folder)], capture_output=True, text=True, cwd=ROOT / "tests", timeout=240)
+    result = subprocess.run([*command, str(folder)], capture_output=True, text=True, cwd=ROOT / "tests", timeout=300)
     assert result.returncode == 0, result.stderr[-3000:]
     return folder, alone, [torch.load(folder / f"rank{i}.pt", weights_only=True) for i in range(2)]
 
@@ -91,6 +104,16 @@ def test_teacher_and_student_stay_equal(ranks: tuple[Path, Trainer, list[dict]])
     assert first["actor.student_acts"]
     for name, value in first.items():
         assert torch.equal(value, second[name]), name
+
+
+def test_of_unequal_numbers_of_steps_they_learn_from_as_many(ranks: tuple[Path, Trainer, list[dict]]) -> None:
+    """Without first steps, whose number differs, and with a value for each group of rewards."""
+    first, second = (rank["grouped"] for rank in ranks[2])
+    # of 32 steps in an iteration, 8 are the first of an episode on one rank, 12 on the other: two minibatches of 20
+    assert first["counts"] == second["counts"] == [10] * 8
+    for name, value in first["weights"].items():
+        assert torch.equal(value, second["weights"][name]), name
+    assert [float(x) for x in first["moments"]] == [float(x) for x in second["moments"]] == [3.0, 3.5]
 
 
 def test_learn_what_one_process_learns_from_the_union(ranks: tuple[Path, Trainer, list[dict]]) -> None:

@@ -66,6 +66,7 @@ WRONG: dict[str, tuple[Transform, Transform, str]] = {
     "survival": (T.SurvivalReward(), failure(), "`terminated`"),
     "end": (T.MotionEnd(lift_box().reference), failure(), "`terminated`"),
     "rate": (T.RewardRate(0.02), term("late"), "a second of the others"),
+    "group": (T.RewardGroups({}, {}), term("late"), "in no group"),
     "return": (RewardSum(in_keys=["reward"], out_keys=["sum"]), term("late"), "return"),
     "rate of return": (RewardSum(in_keys=["reward"], out_keys=["sum"]), T.RewardRate(0.02), "return"),
     "noise": (history(), noise(), "perturbed anew"),
@@ -193,6 +194,7 @@ def test_configs_are_refused_by_name(override: str, message: str):
         ["reset=adaptive"],
         ["randomization=hdmi_push"],
         ["reward=hdmi_survival"],
+        ["reward=hdmi_2025"],
     ],
     ids=" ".join,
 )

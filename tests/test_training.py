@@ -287,6 +287,12 @@ class TestRecovery:
             step_on()
 
 
+def test_without_groups_of_rewards_there_is_one_value(fresh: Trainer) -> None:
+    assert fresh.groups == []
+    assert set(fresh.sizes) == {"policy", "critic", "action"}
+    assert network_of(fresh.critic).mlp[-1].out_features == 1
+
+
 class TestPrepare:
     """What the learner takes of a batch is what it would get from raw observations."""
 

@@ -229,6 +229,11 @@ CASES: dict[str, Case] = {
     "ResidualAction": Case(lambda r, **k: T.ResidualAction(**k), "inverse", (("ref", "joint_pos"),)),
     "ResetNoiseCurriculum": Case(lambda r, **k: T.ResetNoiseCurriculum(20, **k), "init"),
     "Rewind": Case(lambda r, **k: T.Rewind(**k), "init", (("ref", "step"),), random=True),
+    "RewardGroups": Case(
+        lambda r, **k: T.RewardGroups({"near": ["one"]}, {r(("error", "one")): 2.0}, 0.02, **k),
+        "reward",
+        (("error", "one"),),
+    ),
     "RewardRate": Case(lambda r, **k: T.RewardRate(0.02, **k), "reward"),
     "SpringAssist": Case(spring, "inverse", (("ref", "step"), *MOVING_ROOT)),
     "SurvivalReward": Case(lambda r, **k: T.SurvivalReward(**k), "reward"),

@@ -1045,6 +1045,50 @@ class TestKernelReward:
         assert steps[-1]["next", "termination", "far"].all()
 
 
+class TestRewardGroups:
+    def terms(self):
+        kernels = (("near", "a", 2.0), ("firm", "b", 3.0), ("effort", "a", -0.5))
+        return [T.KernelReward(torch.abs, [key], name, weight) for name, key, weight in kernels]
+
+    def groups(self, groups, **parameters):
+        return T.RewardGroups(groups, {term.out_keys[0]: term.weight for term in self.terms()}, **parameters)
+
+    def env(self, groups, control_dt=1.0):
+        script = {"a": table([0.0, 1.0, 4.0]), "b": table([0.0, 2.0, 0.0])}
+        after = (self.groups(groups, control_dt=control_dt), T.RewardRate(control_dt))
+        return wrap(ScriptedEnv(script), *self.terms(), *after)
+
+    def test_sums_weighted_terms_and_together_they_are_the_reward(self):
+        env = self.env({"tracking": ["near", "firm"], "costs": ["effort"]}, control_dt=0.5)
+        check_env_specs(env)
+        assert env.reward_key == "reward"
+        assert env.reset()["reward_groups"].sum().to_dict() == {"tracking": 0.0, "costs": 0.0}
+        steps = drive(env, 2)
+        # 0.5 (2 * 1 + 3 * 2), 0.5 (2 * 4 + 3 * 0); 0.5 * -0.5 * 1, 0.5 * -0.5 * 4
+        close(next_of(steps, ("reward_groups", "tracking")).flatten(), [4.0, 4.0])
+        close(next_of(steps, ("reward_groups", "costs")).flatten(), [-0.25, -1.0])
+        close(next_of(steps, "reward").flatten(), [3.75, 3.0])
+
+    def test_what_no_group_names_is_one_more(self):
+        env = self.env({"tracking": ["near"], "absent": ["balance"]})
+        (step,) = drive(env, 1)
+        rewards = step["next", "reward_groups"]
+        assert sorted(rewards.keys()) == ["other", "tracking"]  # no group without terms
+        close(rewards["other"], [[3.0 * 2 - 0.5]])
+
+    @pytest.mark.parametrize(
+        ("groups", "message"),
+        [
+            ({"a": ["near"], "b": ["firm", "near"]}, "groups: near named more than once"),
+            ({"a": ["near", "near"]}, "near named more than once"),
+            ({"other": ["near"]}, "'other' is made of"),
+        ],
+    )
+    def test_refuses(self, groups, message):
+        with pytest.raises(ValueError, match=message):
+            self.groups(groups)
+
+
 # -- termination ------------------------------------------------------------------------------------------------------
 
 

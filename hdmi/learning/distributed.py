@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 
+import torch
 import torch.distributed as dist
 from torch import Tensor
 
@@ -62,10 +63,23 @@ class Ranks:
         return value / self.size
 
     def moments(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and population variance of the first dimension over all ranks' values. [n, ...] -> [...], [...]"""
-        mean = self.mean(values.mean(0))
+        """Mean and population variance of the first dimension over all ranks' values. [n, ...] -> [...], [...]
+
+        The ranks may have unequal numbers of them.
+        """
+        count = torch.tensor(float(len(values)), device=values.device)
+        share = count / self.mean(count)
+        mean = self.mean(values.mean(0) * share)
         centred = values - mean
-        return mean, self.mean(centred.mul_(centred).mean(0))  # in place: all observations of a batch
+        return mean, self.mean(centred.mul_(centred).mean(0) * share)  # in place: all observations of a batch
+
+    def least(self, count: int) -> int:
+        """The smallest of the ranks' counts."""
+        if self.size == 1:
+            return count
+        counts = [0] * self.size
+        dist.all_gather_object(counts, count)
+        return min(counts)
 
     def mean_row(self, row: dict[str, float]) -> dict[str, float]:
         """Mean of each figure over the ranks that have it."""

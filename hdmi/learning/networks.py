@@ -91,10 +91,10 @@ class _Network(nn.Module):
 
 
 class _ValueHead(_Network):
-    """State value."""
+    """State value, of one or more rewards."""
 
-    def __init__(self, in_size: int, **kwargs: Any):
-        super().__init__(in_size, 1, gain=1.0, **kwargs)
+    def __init__(self, in_size: int, out_size: int, **kwargs: Any):
+        super().__init__(in_size, out_size, gain=1.0, **kwargs)
 
 
 class _GaussianHead(_Network):
@@ -140,9 +140,13 @@ def _actor(head: nn.Module, in_key: NestedKey) -> ProbabilisticActor:
     )
 
 
-def make_critic(in_size: int, hidden: Sequence[int], activation: str, bf16: bool) -> ValueOperator:
-    """State value from privileged observations: `critic` [..., in_size] -> `state_value` [..., 1]."""
-    return _critic(_ValueHead(in_size, hidden=hidden, activation=activation, bf16=bf16))
+def make_critic(in_size: int, hidden: Sequence[int], activation: str, bf16: bool, out_size: int = 1) -> ValueOperator:
+    """State value from privileged observations: `critic` [..., in_size] -> `state_value` [..., out_size].
+
+    Args:
+        out_size: number of rewards that are valued each by itself.
+    """
+    return _critic(_ValueHead(in_size, out_size, hidden=hidden, activation=activation, bf16=bf16))
 
 
 def _critic(head: nn.Module) -> ValueOperator:

@@ -16,10 +16,11 @@ from hdmi.learning.networks import make_actor, make_critic, use_bf16
 def make_networks(
     cfg: DictConfig, sizes: dict[str, int], device: torch.device
 ) -> tuple[ProbabilisticActor, ValueOperator]:
-    """Actor and critic of a config. sizes: of `policy`, `critic` and `action`."""
+    """Actor and critic of a config. sizes: of `policy`, `critic` and `action`, and of `state_value` if not one."""
     algo = cfg.algo
     actor = make_actor_of(cfg, sizes["policy"], sizes["action"], device)
-    critic = make_critic(sizes["critic"], algo.critic_hidden, algo.activation, use_bf16(algo.bf16, device))
+    bf16, values = use_bf16(algo.bf16, device), sizes.get("state_value", 1)
+    critic = make_critic(sizes["critic"], algo.critic_hidden, algo.activation, bf16, values)
     return actor, critic.to(device)
 
 

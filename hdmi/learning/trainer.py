@@ -70,6 +70,15 @@ class Trainer:
     training is the mean of the actor's weights over the last iterations (`average` of those so far), which is steadier
     than any of them.
 
+    Where the environment has `reward_groups`, the critic has a head for each group, trained on that group's returns,
+    and the policy ascends the sum of the groups' advantages. The sum is taken before advantages are normalised, so that
+    the weights of the reward table decide between groups, as they do between terms: with exact values it is the
+    advantage of the summed reward, GAE being linear. What heads add is that each fits returns of one kind.
+
+    With `algo.skip_first` the first step of an episode has a part in no loss and in no moments of advantages: its
+    velocities and histories are of the reset, not of what was done. It keeps its place in the recursion of GAE, and
+    in the moments of observations, since policies have to act in it.
+
     Args:
         cfg: the whole config; `cfg.resume` is a checkpoint to continue from, or null.
         folder: of the run; checkpoints, metrics.csv and config.yaml are written there.
@@ -80,6 +89,7 @@ class Trainer:
         policy: from deployable observations.
         actor: that acts in training: the policy.
         averaged: `averaged.module` is the policy that leaves the training.
+        groups: of rewards that the critic values each by itself, in the order of its heads; none for one head.
 
     Raises:
         CheckpointError: for a checkpoint that cannot be continued under this config; see `restore`.
@@ -124,6 +134,9 @@ class Trainer:
             "critic": spec["critic"].shape[-1],
             "action": self.env.action_spec.shape[-1],
         }
+        self.groups = sorted(spec.get("reward_groups", {}).keys())
+        if self.groups:
+            self.sizes["state_value"] = len(self.groups)
         self.policy, self.critic = make_networks(cfg, self.sizes, self.device)
         self.actor = self._acting()
         # moments do not change within an update: the learner normalises observations once for all epochs
@@ -200,16 +213,23 @@ class Trainer:
 
         Args:
             batch: collected steps, [N, T], the steps of a world in order. Reads `policy`, `critic`, `action`,
-                `action_log_prob`, and of `next` `critic`, `reward`, `done`, `terminated`.
+                `action_log_prob`, and of `next` `critic`, `done`, `terminated`, and `reward` or, if there are G groups,
+                `reward_groups`.
 
         Returns:
-            Batch [N T]: `policy` and `critic` normalised, `action`, `action_log_prob`, `state_value`, and by GAE
-            `advantage` with `algo.lmbda` and `value_target` with `algo.critic_lmbda`, [N T, 1].
+            Batch [N T]: `policy` and `critic` normalised, `action`, `action_log_prob`, `state_value` [N T, G or 1], and
+            by GAE `value_target`, likewise, with `algo.critic_lmbda` and `advantage` [N T, 1], the groups' sum, with
+            `algo.lmbda`.
         """
         data = batch.select(*_COLLECTED_KEYS)
+        if self.groups:
+            rewards = torch.cat([batch["next", "reward_groups", group] for group in self.groups], -1)
+            data["next", "reward"] = rewards
+            for key in ("done", "terminated"):
+                data["next", key] = batch["next", key].expand_as(rewards)
         for key, network in (("policy", self.policy), ("critic", self.critic)):
             data.set(key, network_of(network).normalise(batch[key]))
-        value = self.normalised_critic(data)["state_value"]  # [N, T, 1]
+        value = self.normalised_critic(data)["state_value"]  # [N, T, G or 1]
         # The next state is the next step's, but where an episode or the batch ends.
         last = batch["next", "done"].squeeze(-1).clone()
         last[:, -1] = True
@@ -217,7 +237,8 @@ class Trainer:
         following[last] = self.critic(batch["next"].select("critic")[last])["state_value"]
         data.set(("next", "state_value"), following)
         target = self.returns(data.copy())["value_target"]
-        return self.gae(data).exclude("next").set("value_target", target).reshape(-1)
+        data = self.gae(data).exclude("next").set("value_target", target).reshape(-1)
+        return data.set("advantage", data["advantage"].sum(-1, keepdim=True))
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """One PPO update on a batch [N, T]; returns losses and statistics."""
@@ -225,13 +246,15 @@ class Trainer:
         progress = min(self.frames / self.cfg.total_frames, 1.0)
         self.schedule.target_kl = algo.desired_kl + (algo.final_kl - algo.desired_kl) * progress
         data = self.prepare(batch)
+        if algo.skip_first:
+            data = data[batch["step_count"].flatten() > 0]
         advantage = data["advantage"]
         mean, variance = self.ranks.moments(advantage)
         data["advantage"] = (advantage - mean) / (variance.sqrt() + 1e-6)
-        size = data.shape[0] // algo.minibatches
+        size = self.ranks.least(data.shape[0]) // algo.minibatches  # ranks step together, by means of equal weight
         sums: dict[str, float] = {}
         count = 0
-        for _ in range(algo.epochs):
+        for _ in range(algo.epochs if size else 0):  # all of them may be first steps
             order = torch.randperm(data.shape[0], device=data.device)
             for m in range(algo.minibatches):
                 rows = order[m * size : (m + 1) * size]
@@ -245,8 +268,10 @@ class Trainer:
         self._update_moments(batch)
         self.averaged.update_parameters(self.policy)
         stats = {key: value / max(count, 1) for key, value in sums.items()}
-        target, error = data["value_target"], data["value_target"] - data["state_value"]
-        stats["explained_variance"] = float(1 - error.var() / (target.var() + 1e-8))
+        target, value = data["value_target"], data["state_value"]
+        stats["explained_variance"] = _explained_variance(target.sum(-1), value.sum(-1))
+        for i, group in enumerate(self.groups):
+            stats[f"explained_variance/{group}"] = _explained_variance(target[:, i], value[:, i])
         stats["actor_lr"] = self.actor_optim.param_groups[0]["lr"]
         stats["noise_std"] = float(batch["scale"].mean())
         return stats
@@ -539,6 +564,11 @@ def _parallel(objective: torch.nn.Module) -> DistributedDataParallel:
 def _digest(motion: Path) -> str:
     """Of the files of a motion."""
     return hashlib.sha256(b"".join((motion / name).read_bytes() for name in ("meta.json", "motion.npz"))).hexdigest()
+
+
+def _explained_variance(target: Tensor, value: Tensor) -> float:
+    """Share of the variance of returns [n] that their estimates have."""
+    return float(1 - (target - value).var() / (target.var() + 1e-8))
 
 
 def _recent_mean(mean: Tensor, latest: Tensor, count: Tensor | int, share: float) -> Tensor:

@@ -6,7 +6,7 @@ their names, weights and keys as defaults.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import torch
@@ -19,6 +19,7 @@ from hdmi.names import match_names
 from hdmi.transforms.common import BoundKernel, SpecTransform, below, copied, key_of, soft_limits, spec_like
 
 _GRAVITY = 9.81  # m/s^2
+_OTHER = "other"  # group of reward terms that no group names
 
 
 class RewardTerm(SpecTransform):
@@ -456,3 +457,72 @@ class RewardRate(SpecTransform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Scales the reward of recorded transitions, in their `next`."""
         return tensordict.copy().set("next", self._step(tensordict, tensordict.get("next").copy()))
+
+
+class RewardGroups(SpecTransform):
+    """Writes what groups of reward terms come to, for a learner that values each group by itself.
+
+    A group's reward is `control_dt * sum(weight * term)` over its terms, so that all groups together are the reward
+    behind `RewardRate`, which stays as it is. Terms that no group names are one more group, `other`; a group that has
+    no terms is left out. Reads the terms [N, 1] of the next tensordict; writes `groups_key/<group>` [N, 1],
+    observations that are zero after a reset.
+
+    Args:
+        groups: group -> names of its terms, each the last part of a key.
+        term_weights: key of a term -> what it counts for.
+        control_dt: s; one where the reward is not taken for a rate.
+
+    Raises:
+        ValueError: for a term that is named twice, or a group of the name `other`.
+
+    Examples:
+        >>> terms = {("reward_terms", "near"): 2.0, ("reward_terms", "effort"): -0.5}
+        >>> groups = RewardGroups({"tracking": ["near"], "costs": ["effort"]}, terms, control_dt=0.02)
+        >>> after = TensorDict({"reward_terms": {"near": torch.ones(1, 1), "effort": torch.full((1, 1), 4.0)}}, [1])
+        >>> rewards = groups(TensorDict({"next": after}, [1]))["next", "reward_groups"]
+        >>> rewards["tracking"], rewards["costs"]  # 0.02 * 2, 0.02 * -0.5 * 4
+        (tensor([[0.0400]]), tensor([[-0.0400]]))
+    """
+
+    def __init__(
+        self,
+        groups: Mapping[str, Sequence[str]],
+        term_weights: Mapping[NestedKey, float],
+        control_dt: float = 1.0,
+        groups_key: NestedKey = "reward_groups",
+    ):
+        named = [name for names in groups.values() for name in names]
+        if twice := sorted({name for name in named if named.count(name) > 1}):
+            raise ValueError(f"groups: {', '.join(twice)} named more than once")
+        if _OTHER in groups:
+            raise ValueError(f"groups: {_OTHER!r} is made of the terms that no group names")
+        group_of = {name: group for group, names in groups.items() for name in names}
+        terms: dict[str, list[tuple[NestedKey, float]]] = {group: [] for group in (*groups, _OTHER)}
+        for key, weight in term_weights.items():
+            name = key if isinstance(key, str) else key[-1]
+            terms[group_of.get(name, _OTHER)].append((key_of(key), weight))
+        self.terms = {below(groups_key, group): members for group, members in terms.items() if members}
+        super().__init__(in_keys=[key_of(key) for key in term_weights], out_keys=list(self.terms))
+        self.control_dt = control_dt
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        for group, terms in self.terms.items():
+            reward = sum(weight * next_tensordict.get(key) for key, weight in terms)
+            next_tensordict.set(group, self.control_dt * reward)
+        return next_tensordict
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        zero = torch.zeros(*tensordict_reset.batch_size, 1, device=tensordict_reset.device)
+        for group in self.terms:
+            tensordict_reset.set(group, zero.clone())
+        return tensordict_reset
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Adds the groups' rewards to recorded transitions, in their `next`."""
+        return tensordict.copy().set("next", self._step(tensordict, tensordict.get("next").copy()))
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        observation_spec = copied(observation_spec)
+        for group in self.terms:
+            observation_spec[group] = spec_like(torch.zeros(*observation_spec.shape, 1, device=observation_spec.device))
+        return observation_spec
