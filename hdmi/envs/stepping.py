@@ -20,8 +20,8 @@ class Stack(Compose):
 
     Examples:
         >>> from torchrl.envs import ActionScaling
-        >>> scale = Stack(ActionScaling(loc=1.0, scale=1.0), ActionScaling(loc=0.0, scale=2.0))  # the last one acts first
-        >>> scale.inv(TensorDict({"action": torch.ones(1)}, []))["action"]
+        >>> stack = Stack(ActionScaling(loc=1.0, scale=1.0), ActionScaling(loc=0.0, scale=2.0))
+        >>> stack.inv(TensorDict({"action": torch.ones(1)}, []))["action"]  # the last one acts first
         tensor([3.])
     """
 
