@@ -12,7 +12,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 from tensordict import NestedKey
-from torchrl.envs import Compose, RemoveEmptySpecs, SelectTransform, Transform
+from torchrl.envs import Transform
 
 from hdmi.assets import (
     Effector,
@@ -28,7 +28,7 @@ from hdmi.assets import (
     parse_geom,
 )
 from hdmi.config import ConfigError, build, build_dataclass, one_line, plain_container, task_node
-from hdmi.envs import HumanoidObjectEnv, MaskedResetEnv, PhysicsBackend, ResetEnv, RowResetEnv
+from hdmi.envs import HumanoidObjectEnv, Keep, MaskedResetEnv, PhysicsBackend, ResetEnv, RowResetEnv, Stack
 from hdmi.envs.resets import check_row_resets
 from hdmi.motion import Reference, find_motion, make_reference
 from hdmi.motion.dynamics import reference_torque
@@ -222,14 +222,14 @@ def make_env(
             check_row_resets(transform)
         except TypeError as error:
             raise ConfigError(f"{node}: {error}") from error
-    stack = Compose(*(transform for _, transform in transforms)).to(base.device)
+    stack = Stack(*(transform for _, transform in transforms)).to(base.device)
     settings = {"envs_per_thread": cfg.get("envs_per_thread"), **cfg.get("starts", {})}
     env = (MaskedResetEnv if base.backend.masked else RowResetEnv)(base, stack, **settings)
     # raw keys are dropped, but for what steps read back and what learners and logs want
     state = set(env.full_state_spec.keys(True, True))
     entries = list(env.full_observation_spec.keys(True, True))
-    env.append_transform(SelectTransform(*(key for key in entries if key in state or _top(key) in OUTPUTS)))
-    env.append_transform(RemoveEmptySpecs())
+    wanted = [key for key in entries if key in state or _top(key) in OUTPUTS]
+    env.append_transform(Keep([*wanted, *env.reward_keys, *env.done_keys]))
     return env
 
 

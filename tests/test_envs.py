@@ -8,17 +8,18 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from mocks import ScriptedEnv, assert_same, lift_box, load_config, make_script
+from mocks import ScriptedEnv, assert_same, drive, lift_box, load_config, make_script
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs import transforms as tt
+from torchrl.envs.utils import check_env_specs
 
 from hdmi.assembly import make_env
 from hdmi.assets import ObjectConfig, RobotConfig, Scene, SimConfig, build_scene
 from hdmi.config import ConfigError
-from hdmi.envs import BatchBackend, HumanoidObjectEnv, MaskedResetEnv, ResetEnv, RowResetEnv
+from hdmi.envs import BatchBackend, HumanoidObjectEnv, Keep, MaskedResetEnv, ResetEnv, RowResetEnv, Stack
 from hdmi.learning.collectors import WorldCollector
 
 DETERMINISTIC = ("+ablation=no_randomization", "reset.state.start=first", "~reset.state.noise")
@@ -212,10 +213,15 @@ class TestRowReset:
         assert (mass[:, box] != before[:, box]).tolist() == [False, False, True, False, False]
 
     def test_each_row_gets_its_own_state(self):
+        class Places(tt.Transform):
+            def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
+                if tensordict is None:
+                    return None
+                return tensordict.set(("init", "root_pos"), torch.arange(12.0).view(4, 3)[tensordict["worlds"]])
+
         base = env_of(4, *DETERMINISTIC).base_env
-        env = RowResetEnv(base, Compose())
+        env = RowResetEnv(base, Compose(Places()))
         start = env.reset()
-        start["init"] = TensorDict({"root_pos": torch.arange(12.0).view(4, 3)}, batch_size=[4])
         start["done"][[1, 3]] = True
         rows = env.maybe_reset(start)["robot", "root_pos"]
         assert rows[[1, 3]].tolist() == [[3, 4, 5], [9, 10, 11]]
@@ -228,10 +234,11 @@ class RowsEnv(ScriptedEnv):
     def __init__(self) -> None:
         super().__init__(make_script([("error", "many")], n=4))
 
-    def reset_rows(self, tensordict: TensorDictBase) -> TensorDictBase:
-        worlds = tensordict["worlds"]
+    def place(self, worlds: torch.Tensor, init: TensorDictBase | None) -> None:
         self.counter = self.counter.clone()
         self.counter[worlds] = 0
+
+    def show(self, worlds: torch.Tensor | slice) -> TensorDictBase:
         return self._state()[worlds]
 
 
@@ -299,6 +306,40 @@ class TestTorchRLTransforms:
         node = "{_target_: torchrl.envs.CatFrames, N: 2, dim: -1, in_keys: [[robot, joint_pos]]}"
         with pytest.raises(ConfigError, match=r"^tracking\.frames: CatFrames: .*use hdmi\.transforms\.History$"):
             env_of(2, f"+tracking.frames={node}")
+
+
+class TestStack:
+    def test_hands_actions_from_last_to_first(self):
+        stack = Stack(tt.ActionScaling(loc=1.0, scale=3.0), tt.ActionScaling(loc=0.5, scale=2.0))
+        env = TransformedEnv(RowsEnv(), stack)
+        env.step(env.reset().set("action", torch.ones(4, 4)))
+        assert torch.equal(env.base_env.received, torch.full((4, 4), 3 * (2 * 1 + 0.5) + 1))
+
+    def test_hands_resets_from_last_to_first(self):
+        class Note(tt.Transform):
+            def __init__(self, name: str):
+                super().__init__()
+                self.name = name
+
+            def _reset_env_preprocess(self, tensordict: TensorDictBase) -> TensorDictBase:
+                seen.append(self.name)
+                return tensordict
+
+        seen: list[str] = []
+        TransformedEnv(RowsEnv(), Stack(Note("first"), Note("last"))).reset()
+        assert seen == ["last", "first"]
+
+
+def test_keep_does_as_torchrl_in_two_transforms():
+    theirs = Compose(tt.StepCounter(), tt.SelectTransform("step_count"), tt.RemoveEmptySpecs())
+    ours = Compose(tt.StepCounter(), Keep(["step_count", "absent", "reward", "done", "terminated", "truncated"]))
+    envs = [TransformedEnv(RowsEnv(), transform) for transform in (ours, theirs)]
+    for env in envs:
+        check_env_specs(env)
+        assert set(env.full_observation_spec.keys(True, True)) == {"step_count"}
+        assert "error" not in env.full_observation_spec.keys(True)
+    for a, b in zip(*(drive(env, 3) for env in envs), strict=True):
+        assert_same(a, b)
 
 
 def test_torch_threads_are_few_while_it_steps_and_as_before_afterwards(monkeypatch: pytest.MonkeyPatch):

@@ -153,7 +153,7 @@ def test_the_environment_puts_scenery_where_it_is_told():
     env = HumanoidObjectEnv(scene, 3)
     env.reset()
     places = torch.tensor([[[3.1, 0.0, 0.3]], [[3.0, 0.2, 0.3]]])
-    env.reset_rows(TensorDict({"init": {"scenery_pos": places}, "worlds": torch.tensor([0, 2])}, batch_size=[2]))
+    env.place(torch.tensor([0, 2]), TensorDict({"scenery_pos": places}, batch_size=[2]))
     found = [env.backend.world(i)[1].body("stand").xpos.tolist() for i in range(3)]
     np.testing.assert_allclose(found, [[3.1, 0, 0.3], [3, 0, 0.3], [3, 0.2, 0.3]], atol=1e-6)
 

@@ -136,7 +136,7 @@ def step_env(
 
 def transform_times(cfg: DictConfig, task: Task, policy: Any, count: int) -> dict[str, float]:
     """Milliseconds per control step that each transform takes if it is not compiled, resets included."""
-    names = [name for name, _ in make_transforms(cfg, task)] + ["select outputs", "remove empty specs"]
+    names = [name for name, _ in make_transforms(cfg, task)] + ["outputs"]
     spent: dict[str, float] = defaultdict(float)
     env = make_env(cfg, task=task)
     with torch.no_grad():

@@ -204,7 +204,7 @@ class HumanoidObjectEnv(EnvBase):
             return self._fallback.where(failed, self._state(slice(None)))
         if failed.any():
             self._diverged += failed.sum()
-            self._reset_worlds(failed.nonzero().squeeze(-1), None)
+            self.place(failed.nonzero().squeeze(-1), None)
         return self._state(slice(None))
 
     def _push(self, velocity: Tensor) -> None:
@@ -229,26 +229,21 @@ class HumanoidObjectEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         init = None if tensordict is None else tensordict.get("init", None)
-        self._reset_worlds(self._everyone if mask is None else mask.reshape(-1), init)
-        return self._fresh(slice(None), self.batch_size)
+        self.place(self._everyone if mask is None else mask.reshape(-1), init)
+        return self.show(slice(None))
 
-    def reset_rows(self, tensordict: TensorDictBase) -> TensorDict:
-        """Resets some worlds and returns only theirs.
+    def show(self, worlds: Tensor | slice) -> TensorDict:
+        """What `reset` writes, of some worlds, as they are.
 
         Args:
-            tensordict: batch [n], with the worlds' numbers `worlds` int64 [n]; otherwise as for `reset`.
+            worlds: their numbers, int64 [n], or `slice(None)` for all.
 
         Returns:
-            What `reset` writes, batch [n].
+            Batch [n].
         """
-        worlds = tensordict.get("worlds")
-        self._reset_worlds(worlds, tensordict.get("init", None))
-        return self._fresh(worlds, worlds.shape)
-
-    def _fresh(self, rows: Tensor | slice, batch_size: torch.Size) -> TensorDict:
-        out = self._state(rows)
+        out = self._state(worlds)
         for key in ("diverged", "done", "terminated", "truncated"):
-            out.set(key, torch.zeros(*batch_size, 1, dtype=torch.bool, device=self.device))
+            out.set(key, torch.zeros(*out.batch_size, 1, dtype=torch.bool, device=self.device))
         return out
 
     def _set_seed(self, seed: int | None) -> None:
@@ -268,8 +263,8 @@ class HumanoidObjectEnv(EnvBase):
 
     # -- reset ------------------------------------------------------------------------------------------------
 
-    def _reset_worlds(self, worlds: Tensor, init: TensorDictBase | None) -> None:
-        """Puts worlds into the model's default state, overwritten by what `init` gives.
+    def place(self, worlds: Tensor, init: TensorDictBase | None) -> None:
+        """Puts worlds into the model's default state, overwritten by what `init` gives; `show` tells what that is.
 
         Args:
             worlds: numbers, int64 [n], with an `init` of batch [n]; or a mask, bool [N], with an `init` of batch [N].
@@ -347,7 +342,8 @@ class HumanoidObjectEnv(EnvBase):
             return self.backend.data(field)[rows].to(torch.float32, copy=True)
 
         xpos, xquat = read("xpos"), read("xquat")  # [N, nbody, *]
-        lin_vel, ang_vel = body_velocity(read("cvel"), xpos, read("subtree_com")[:, self._body_root])
+        com = read("subtree_com").index_select(1, self._body_root)  # a quarter of the time that indexing takes
+        lin_vel, ang_vel = body_velocity(read("cvel"), xpos, com)
         qpos, qvel, sensors = read("qpos"), read("qvel"), read("sensordata")
         joint_vel = qvel[:, self._joint_dof]
         robot = {
@@ -401,7 +397,7 @@ class HumanoidObjectEnv(EnvBase):
 
     def _default_state(self) -> TensorDict:
         """What any world shows in the default state. Batch [N], one row's memory."""
-        self._reset_worlds(self._everyone, None)
+        self.place(self._everyone, None)
         return self._state(torch.zeros(1, dtype=torch.int64, device=self.device)).expand(self.batch_size)
 
     def render(self, index: int = 0, height: int = 480, width: int = 640) -> np.ndarray:

@@ -36,8 +36,9 @@ class ResetEnv(SteppedEnv):
     `ReferenceStateInitialization`). How many were is counted in `num_redrawn`, and how many stayed too deep all the
     same in `num_deep`.
 
-    The base environment must have `penetration` if anything is to be drawn again (see `HumanoidObjectEnv`), and
-    transforms must take the batch size from the tensordict and keep nothing of single environments in themselves.
+    The base environment must have `place` and `show`, and `penetration` if anything is to be drawn again (see
+    `HumanoidObjectEnv`). Transforms are given state and flags of the end of the episodes that ended; they must take the
+    batch size from the tensordict and keep nothing of single environments in themselves.
 
     Args:
         env, transform, envs_per_thread: as for `SteppedEnv`.
@@ -91,38 +92,39 @@ class ResetEnv(SteppedEnv):
         return super().insert_transform(index, transform)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        keys = [*self.reset_keys, *self.state_spec.keys(True, True)]
+        keys = [*self.reset_keys, *self.full_state_spec.keys(True, True)]
         tensordict = None if tensordict is None else tensordict.select(*keys, strict=False)
         start = self.transform._reset_env_preprocess(tensordict)
         fresh = self.base_env._reset(start, **kwargs)
         start = fresh.empty() if start is None else start
-        mask = start.get("_reset", None)
-        if mask is None:
-            mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
-        self._redraw(start, fresh, mask.reshape(-1))
+        if self.redraws:
+            mask = start.get("_reset", None)
+            if mask is None:
+                mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+            self._redraw(start, mask.reshape(-1))
+            fresh = self.base_env.show(slice(None))
         return self.transform._reset(start, fresh)
 
     @abstractmethod
-    def _redraw(self, start: TensorDictBase, fresh: TensorDictBase, mask: Tensor) -> None:
-        """Draws starts again where they are too deep, and writes them into `start` and `fresh`.
+    def _redraw(self, start: TensorDictBase, mask: Tensor) -> None:
+        """Draws starts again where they are too deep, and writes into `start` where they are then.
 
         Args:
             start: what worlds were reset to, with `init`; batch [N].
-            fresh: the base environment's state after that; batch [N].
             mask: which worlds are meant, bool [N].
         """
 
     def _too_deep(self, worlds: Tensor | slice = slice(None)) -> Tensor:
         return self.base_env.penetration()[worlds] > self.max_penetration
 
-    def _again(self, start: TensorDictBase, attempt: int) -> TensorDictBase:
-        """A start to draw again: what came before, how much of the noise is left, and in the first half the frame."""
+    def _again(self, start: TensorDictBase, attempt: int, rows: Tensor | slice = slice(None)) -> TensorDictBase:
+        """Starts to draw again: what came before, how much of the noise is left, and in the first half the frame."""
         half = (self.redraws + 1) // 2
         share, frame = max(0.0, 1 - attempt / half), start.get(FRAME_KEY, None)
-        again = start.exclude("init")
-        again.set(NOISE_SHARE_KEY, torch.full((*start.batch_size, 1), share, device=start.device))
+        again = start.exclude("init")[rows]
+        again.set(NOISE_SHARE_KEY, torch.full((*again.batch_size, 1), share, device=start.device))
         if frame is not None and attempt <= half:
-            again.set(FRAME_KEY, frame)
+            again.set(FRAME_KEY, frame[rows])
         return again
 
 
@@ -133,8 +135,6 @@ class RowResetEnv(ResetEnv):
     then costs twice. Here base environment and transforms are given the n rows, with their numbers
     under `worlds` int64 [n], and results are written into copies of the others' tensors. `reset` itself is unchanged.
 
-    The base environment must have `reset_rows` (see `HumanoidObjectEnv`).
-
     Examples:
         >>> from torchrl.envs import Compose, StepCounter
         >>> from hdmi.assets import RobotConfig, SimConfig, build_scene
@@ -144,23 +144,22 @@ class RowResetEnv(ResetEnv):
         [1, 2, 1, 2]
     """
 
-    def _redraw(self, start: TensorDictBase, fresh: TensorDictBase, mask: Tensor) -> None:
-        self._redraw_rows(start, fresh, *[mask.nonzero().squeeze(-1)] * 2)
+    def _redraw(self, start: TensorDictBase, mask: Tensor) -> None:
+        self._redraw_rows(start, *[mask.nonzero().squeeze(-1)] * 2)
 
-    def _redraw_rows(self, start: TensorDictBase, fresh: TensorDictBase, worlds: Tensor, at: Tensor) -> None:
+    def _redraw_rows(self, start: TensorDictBase, worlds: Tensor, at: Tensor) -> None:
         """As `_redraw`, of the worlds of these numbers, which stand `at` these places in the batch. int64 [n]"""
         for attempt in range(1, self.redraws + 1):
             rows = self._too_deep(worlds).nonzero().squeeze(-1)
             if not len(rows):
                 return
             self._counts[0] += len(rows)
-            again = self._again(start[at[rows]], attempt).set("worlds", worlds[rows])
+            again = self._again(start, attempt, at[rows]).set("worlds", worlds[rows])
             again = self.transform._reset_env_preprocess(again)
-            fresh[at[rows]] = self.base_env.reset_rows(again)
+            self.base_env.place(worlds[rows], again.get("init", None))
             if (frame := start.get(FRAME_KEY, None)) is not None:
                 start.set(FRAME_KEY, frame.index_put((at[rows],), again.get(FRAME_KEY)))
-        if self.redraws:
-            self._counts[1] += self._too_deep(worlds).sum()
+        self._counts[1] += self._too_deep(worlds).sum()
 
     def compile_transforms(self, **options: Any) -> None:
         """Compiles the transforms; see `SteppedEnv`. Resets of all environments and of a single one stay as they are.
@@ -191,11 +190,14 @@ class RowResetEnv(ResetEnv):
         worlds = tensordict.get("_reset").reshape(-1).nonzero().squeeze(-1)
         # taking rows out of large tensors would wake the other threads already
         with torch_threads(len(worlds), self.envs_per_thread):
-            part = tensordict[worlds].set("worlds", worlds)
+            keys = [*self.reset_keys, *self.done_keys, *self.full_state_spec.keys(True, True)]
+            part = tensordict.select(*keys, strict=False)[worlds].set("worlds", worlds)
             tensordict = tensordict.exclude("_reset")
             part = self.transform._reset_env_preprocess(part)
-            state = self.base_env.reset_rows(part)
-            self._redraw_rows(part, state, worlds, torch.arange(len(worlds)))
+            self.base_env.place(worlds, part.get("init", None))
+            if self.redraws:
+                self._redraw_rows(part, worlds, torch.arange(len(worlds)))
+            state = self.base_env.show(worlds)
             # a kernel for n rows would be compiled anew for one
             reset = self._reset_transforms if len(worlds) > 1 else self.transform._reset
             fresh = reset(part, state)
@@ -221,17 +223,15 @@ class MaskedResetEnv(ResetEnv):
         [1, 2, 1, 2]
     """
 
-    def _redraw(self, start: TensorDictBase, fresh: TensorDictBase, mask: Tensor) -> None:
+    def _redraw(self, start: TensorDictBase, mask: Tensor) -> None:
         for attempt in range(1, self.redraws + 1):
             deep = mask & self._too_deep()
             self._counts[0] += deep.sum()
             again = self.transform._reset_env_preprocess(self._again(start, attempt))
-            state = self.base_env._reset(again.copy().set("_reset", deep.unsqueeze(-1)))
-            fresh.update(state.where(deep, fresh))
+            self.base_env.place(deep, again.get("init", None))
             if (frame := start.get(FRAME_KEY, None)) is not None:
                 start.set(FRAME_KEY, torch.where(deep.unsqueeze(-1), again.get(FRAME_KEY), frame))
-        if self.redraws:
-            self._counts[1] += (mask & self._too_deep()).sum()
+        self._counts[1] += (mask & self._too_deep()).sum()
 
     def compile_transforms(self, **options: Any) -> None:
         super().compile_transforms(**options)
@@ -244,8 +244,10 @@ class MaskedResetEnv(ResetEnv):
             return tensordict
         mask = done.reshape(-1)
         part = self.transform._reset_env_preprocess(tensordict.copy())
-        state = self.base_env._reset(part.copy().set("_reset", done))
-        self._redraw(part, state, mask)
+        self.base_env.place(mask, part.get("init", None))
+        if self.redraws:
+            self._redraw(part, mask)
+        state = self.base_env.show(slice(None))
         fresh, tensordict = self.transform._reset(part, state), tensordict.copy()
         for key, value in fresh.items(True, True):
             chosen = mask.reshape(-1, *[1] * (value.ndim - 1))

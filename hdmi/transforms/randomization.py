@@ -93,7 +93,7 @@ class ModelRandomization(SpecTransform):
     def _draw_again(self, init: TensorDictBase, worlds: Tensor | None) -> None:
         """The same numbers at every reset; terms per episode build on the rows that this one writes."""
         rows = self._world_rows
-        if not rows or set(rows).intersection(init.keys(True, True)):
+        if not rows or any(init.get(key, None) is not None for key in rows):
             rows = self._draw_everyone(init, worlds)
         for key, value in rows.items():
             init.set(key, value if worlds is None else value[worlds])

@@ -385,7 +385,7 @@ class FeetSlip(RewardTerm):
 
     def function(self, *inputs: Tensor) -> Tensor:
         velocity, force = inputs
-        return F.feet_slip(velocity[..., self.feet, :], force, force_threshold=self.force_threshold)
+        return F.feet_slip(velocity.index_select(-2, self.feet), force, force_threshold=self.force_threshold)
 
 
 class FeetStumble(KernelReward):

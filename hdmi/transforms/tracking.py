@@ -111,7 +111,7 @@ class AbsoluteDifference(FunctionTransform):
 
     def function(self, *inputs: Tensor) -> Tensor:
         difference = (inputs[0] - inputs[1]).abs()
-        return difference if self.index is None else difference[..., self.index]
+        return difference if self.index is None else difference.index_select(-1, self.index)
 
 
 class BodyHeightError(FunctionTransform):
@@ -223,7 +223,8 @@ class ContactPoints(FunctionTransform):
 
     def function(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         body_pos, body_quat, link_pos, link_quat, scale, points = inputs
-        eef = body_pos[..., self.index, :] + quat_apply(body_quat[..., self.index, :], self.points)
+        eef_pos, eef_quat = (value.index_select(-2, self.index) for value in (body_pos, body_quat))
+        eef = eef_pos + quat_apply(eef_quat, self.points)
         scaled = points * scale.unsqueeze(-1)
         target = link_pos.unsqueeze(-2) + quat_apply(link_quat.unsqueeze(-2), scaled)
         return eef, target
