@@ -148,6 +148,7 @@ class TestAblations:
         assert all(target.startswith(("hdmi.", "torchrl.")) for target in targets)
 
 
+PAPER = ("+method=paper",)
 LEVERS = sorted(path.stem for path in (CONF / "lever").glob("*.yaml"))
 # nodes that a lever adds, those that it takes out, and those that it changes
 CHANGED_BY_LEVER: dict[str, tuple[set[str], set[str], set[str]]] = {
@@ -162,11 +163,10 @@ CHANGED_BY_LEVER: dict[str, tuple[set[str], set[str], set[str]]] = {
     ),
     "rewind": ({"reset.rewind"}, set(), set()),
     "root_history": ({"noise.root_reference", "history.root_reference"}, set(), set()),
-    "small_batches": (set(), set(), set()),
     "springs": ({"assist.root"}, set(), set()),
     "springs_object": ({"assist.object"}, set(), set()),
 }
-OF_THE_LEARNER = {"small_batches": {"num_envs", "algo"}}
+ON_BY_DEFAULT = ("early_end", "feedforward")
 
 
 class TestLevers:
@@ -175,15 +175,23 @@ class TestLevers:
 
     @pytest.mark.parametrize("name", LEVERS)
     def test_changes_exactly_its_nodes(self, name):
-        default, pulled = stack_of(), stack_of(f"+lever={name}")
+        default, pulled = stack_of(*PAPER), stack_of(*PAPER, f"+lever={name}")
         added, gone, changed = CHANGED_BY_LEVER[name]
         assert set(pulled) - set(default) == added
         assert set(default) - set(pulled) == gone
         assert [node for node in pulled if node not in added] == [node for node in default if node not in gone]
         assert {node for node in default if node in pulled and pulled[node] != default[node]} == changed
-        before, after = load_config(), load_config(f"+lever={name}")
-        stack = {node.partition(".")[0] for node in added | gone | changed}
-        assert {key for key in before if before[key] != after[key]} == stack | OF_THE_LEARNER.get(name, set())
+        before, after = load_config(*PAPER), load_config(*PAPER, f"+lever={name}")
+        assert {key for key in before if before[key] != after[key]} == {
+            node.partition(".")[0] for node in added | gone | changed
+        }
+
+    def test_the_paper_s_method_is_without_those_that_are_on(self):
+        ours, paper = load_config("task=walk"), load_config("task=walk", *PAPER, f"+lever=[{','.join(ON_BY_DEFAULT)}]")
+        assert {key for key in ours if ours[key] != paper[key]} == {"algo"}
+        assert paper.algo == load_config("task=walk", "algo=ppo_wide").algo != ours.algo
+        again = load_config("task=walk", *PAPER)  # what a lever merged into does not come back changed
+        assert (again.reference.target, again.early_end) == (None, None)
 
     def test_a_privileged_policy_sees_what_the_critic_sees(self):
         assert load_config("+lever=privileged").input.policy.groups == load_config().input.critic.groups

@@ -305,17 +305,21 @@ class TestResetNoiseCurriculum:
         )
 
     def test_perturbations_grow_with_the_steps(self, reference):
-        env = self.env(reference, total_steps=8, start=0.25, grow=0.5)
+        env = self.env(reference, total_steps=8, start=0.25, hold=0.25, grow=0.5)
         largest = []
-        for _ in range(6):
+        for _ in range(8):
             td = env.reset()
             largest.append(float((td["robot", "root_lin_vel"] - reference.body_lin_vel[20, 0]).abs().max()))
             env.step(td.set("action", td["robot", "joint_pos"]))
-        close(torch.tensor(largest), 2.0 * torch.tensor([0.25, 0.4375, 0.625, 0.8125, 1.0, 1.0]), 0.1)
+        close(torch.tensor(largest), 2.0 * torch.tensor([0.25, 0.25, 0.25, 0.4375, 0.625, 0.8125, 1.0, 1.0]), 0.1)
 
     @pytest.mark.parametrize(
         ("given", "message"),
-        [({"start": 1.5}, "start: expected a share from 0"), ({"grow": 0.0}, "grow: expected a share of")],
+        [
+            ({"start": 1.5}, "start: expected a share from 0"),
+            ({"grow": 0.0}, "grow: expected parts of the training"),
+            ({"hold": 0.6, "grow": 0.6}, "at most 1 together, got 0.6, 0.6"),
+        ],
     )
     def test_bad_shares(self, given, message):
         with pytest.raises(ValueError, match=message):

@@ -145,9 +145,7 @@ class Trainer:
         self.averaged = AveragedModel(self.policy, avg_fn=partial(_recent_mean, share=algo.average))
         objective = self._objective()
         self.objective = objective if self.ranks.size == 1 else _parallel(objective)
-        self.gae, self.returns = (
-            GAE(gamma=algo.gamma, lmbda=lmbda, value_network=None) for lmbda in (algo.lmbda, algo.critic_lmbda)
-        )
+        self.gae = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=None)
         self.actor_optim = torch.optim.Adam(self.actor.parameters(), lr=algo.actor_lr, fused=True)
         self.critic_optim = torch.optim.Adam(self.critic.parameters(), lr=algo.critic_lr, fused=True)
         self.schedule = KLAdaptiveLR(
@@ -217,9 +215,8 @@ class Trainer:
                 `reward_groups`.
 
         Returns:
-            Batch [N T]: `policy` and `critic` normalised, `action`, `action_log_prob`, `state_value` [N T, G or 1], and
-            by GAE `value_target`, likewise, with `algo.critic_lmbda` and `advantage` [N T, 1], the groups' sum, with
-            `algo.lmbda`.
+            Batch [N T]: `policy` and `critic` normalised, `action`, `action_log_prob`, and by GAE `state_value` and
+            `value_target` [N T, G or 1] and `advantage` [N T, 1], the groups' sum.
         """
         data = batch.select(*_COLLECTED_KEYS)
         if self.groups:
@@ -236,8 +233,7 @@ class Trainer:
         following = value.roll(-1, dims=1)
         following[last] = self.critic(batch["next"].select("critic")[last])["state_value"]
         data.set(("next", "state_value"), following)
-        target = self.returns(data.copy())["value_target"]
-        data = self.gae(data).exclude("next").set("value_target", target).reshape(-1)
+        data = self.gae(data).exclude("next").reshape(-1)
         return data.set("advantage", data["advantage"].sum(-1, keepdim=True))
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:

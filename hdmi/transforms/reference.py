@@ -389,17 +389,18 @@ class Rewind(SpecTransform):
 class ResetNoiseCurriculum(SpecTransform):
     """Starts episodes with a share of the perturbations that grows while training goes on.
 
-    The share rises linearly with the steps taken, from `start` to 1; their count is a buffer that goes with the
-    transform's state. Reads on reset, where it is, and writes `noise_share_key` [N, 1], which
+    The share is `start` for a while and then rises linearly with the steps taken, to 1; their count is a buffer that
+    goes with the transform's state. Reads on reset, where it is, and writes `noise_share_key` [N, 1], which
     `ReferenceStateInitialization` reads: what was asked for, times the share. It has no effect between resets.
 
     Args:
         total_steps: of the training, for each environment.
         start: share at first.
-        grow: share of `total_steps` after which perturbations are whole.
+        hold: part of `total_steps` before it rises.
+        grow: part of `total_steps` in which it rises.
 
     Examples:
-        >>> curriculum = ResetNoiseCurriculum(total_steps=100, start=0.2, grow=0.5)
+        >>> curriculum = ResetNoiseCurriculum(total_steps=100, start=0.2)
         >>> asked = TensorDict({"init": {"noise_share": torch.tensor([[1.0], [0.5]])}}, [2])
         >>> curriculum._reset_env_preprocess(asked)["init", "noise_share"].flatten()
         tensor([0.2000, 0.1000])
@@ -408,23 +409,29 @@ class ResetNoiseCurriculum(SpecTransform):
     training_only = True
 
     def __init__(
-        self, total_steps: int, start: float = 0.3, grow: float = 0.5, noise_share_key: NestedKey = NOISE_SHARE_KEY
+        self,
+        total_steps: int,
+        start: float = 0.3,
+        hold: float = 0.4,
+        grow: float = 0.3,
+        noise_share_key: NestedKey = NOISE_SHARE_KEY,
     ):
         super().__init__()
         if not 0 <= start <= 1:
             raise ValueError(f"reset: curriculum: start: expected a share from 0 to 1, got {start}")
-        if not 0 < grow <= 1:
+        if not (hold >= 0 < grow and hold + grow <= 1):
             raise ValueError(
-                f"reset: curriculum: grow: expected a share of the training, above 0 and up to 1, got {grow}"
+                "reset: curriculum: hold, grow: expected parts of the training, the second above 0, of at most 1 "
+                f"together, got {hold}, {grow}"
             )
-        self.start, self.grow_steps = start, max(grow * total_steps, 1.0)
+        self.start, self.hold_steps, self.grow_steps = start, hold * total_steps, max(grow * total_steps, 1.0)
         self.noise_share_key = key_of(noise_share_key)
         self.register_buffer("steps", torch.zeros(()))
 
     @property
     def share(self) -> Tensor:
         """Of the perturbations, from `start` to 1."""
-        return self.start + (1 - self.start) * (self.steps / self.grow_steps).clamp(max=1)
+        return self.start + (1 - self.start) * ((self.steps - self.hold_steps) / self.grow_steps).clamp(0, 1)
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         if tensordict is None:
