@@ -445,6 +445,7 @@ class TestInTorchRL:
         assert rollout.shape == (2, 2, 3)
         assert rollout["next", "policy"].isfinite().all()
 
+    @pytest.mark.slow
     def test_parallel(self):
         env = ParallelEnv(2, partial(make_default))
         try:

@@ -402,6 +402,7 @@ def test_forces_after_a_reset_are_those_of_its_own_targets():
     assert first.abs().max() < 1e-3
 
 
+@pytest.mark.slow
 def test_compiled_transforms_equal_eager_ones():
     """The whole default stack is one graph, in a step and in a reset of some rows, and computes the same."""
     results = []
