@@ -166,7 +166,7 @@ CHANGED_BY_LEVER: dict[str, tuple[set[str], set[str], set[str]]] = {
     "springs": ({"assist.root"}, set(), set()),
     "springs_object": ({"assist.object"}, set(), set()),
 }
-ON_BY_DEFAULT = ("early_end", "feedforward")
+ON_BY_DEFAULT = ("early_end", "feedforward", "noise_curriculum")
 
 
 class TestLevers:
@@ -191,7 +191,7 @@ class TestLevers:
         assert {key for key in ours if ours[key] != paper[key]} == {"algo"}
         assert paper.algo == load_config("task=walk", "algo=ppo_wide").algo != ours.algo
         again = load_config("task=walk", *PAPER)  # what a lever merged into does not come back changed
-        assert (again.reference.target, again.early_end) == (None, None)
+        assert (again.reference.target, again.early_end, again.reset.curriculum) == (None, None, None)
 
     def test_a_privileged_policy_sees_what_the_critic_sees(self):
         assert load_config("+lever=privileged").input.policy.groups == load_config().input.critic.groups

@@ -106,7 +106,7 @@ class TestContinuation:
             pytest.param(["seed=3"], marks=pytest.mark.slow),
             pytest.param(["seed=1", "+ablation=no_randomization"], marks=pytest.mark.slow),
             pytest.param(["seed=2", "+ablation=no_interaction_reward_no_contact_termination"], marks=pytest.mark.slow),
-            ["reset=adaptive", "+lever=[springs,springs_object,rewind]", "seed=5"],
+            ["reset=adaptive", "+lever=[springs,springs_object,rewind,noise_curriculum]", "seed=5"],
         ],
         ids=lambda overrides: overrides[-1],
     )
