@@ -214,8 +214,7 @@ def make_env(
     """
     task = make_task(cfg) if task is None else task
     base = HumanoidObjectEnv(task.scene, num_envs or cfg.num_envs, backend or backend_of(cfg), pixels)
-    here = replace(task, reference=task.reference.to(base.device))
-    transforms = make_transforms(cfg, here)
+    transforms = make_transforms(cfg, task, base.device)
     check_reads(transforms, base)
     for node, transform in transforms:
         try:
@@ -237,8 +236,11 @@ def _top(key: Any) -> str:
     return key if isinstance(key, str) else key[0]
 
 
-def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
+def make_transforms(cfg: DictConfig, task: Task, device: torch.device | None = None) -> list[tuple[str, Transform]]:
     """The transforms of a config with the names of their nodes, from the base environment outwards.
+
+    Args:
+        device: of the reference that transforms follow; where the task's is if absent.
 
     Raises:
         ConfigError: for a node that cannot be built, or that does not stand where it has to (see `hdmi.order`).
@@ -254,7 +256,7 @@ def make_transforms(cfg: DictConfig, task: Task) -> list[tuple[str, Transform]]:
         "default_pos": robot.default_joint_pos,
         "servo_stiffness": robot.stiffness,
         "servo_damping": robot.damping,
-        "reference": task.reference,
+        "reference": task.reference if device is None else task.reference.to(device),
         "starts": task.starts,
         "total_steps": cfg.total_frames // (cfg.num_envs * _ranks()),
         "joint_torque": lambda: task.joint_torque,  # a second of work that only some stacks need

@@ -177,7 +177,7 @@ class TestReads:
         ),
         (
             "stack=[action,reference]",
-            r"action\.target \(ResidualAction\) reads \('ref', 'joint_pos'\), which reference\.motion",
+            r"action\.target \(ResidualAction\) reads \('ref', 'joint_target'\), which reference\.target",
         ),
         ("tracking.feet=null", r"reward\.feet_impact \(FeetImpactL2\) reads \('feet', 'force'\), which nothing"),
     ],
