@@ -258,7 +258,7 @@ def make_transforms(cfg: DictConfig, task: Task, device: torch.device | None = N
         "servo_damping": robot.damping,
         "reference": task.reference if device is None else task.reference.to(device),
         "starts": task.starts,
-        "total_steps": cfg.total_frames // (cfg.num_envs * _ranks()),
+        "total_steps": cfg.total_frames // (cfg.num_envs * num_ranks()),
         "joint_torque": lambda: task.joint_torque,  # a second of work that only some stacks need
         "model": task.scene.model,
         "robot_bodies": task.scene.body_ids.tolist(),
@@ -285,7 +285,7 @@ def make_transforms(cfg: DictConfig, task: Task, device: torch.device | None = N
     return stack
 
 
-def _ranks() -> int:
+def num_ranks() -> int:
     """Processes that train together: frames are counted over all of them."""
     return torch.distributed.get_world_size() if torch.distributed.is_initialized() else 1
 

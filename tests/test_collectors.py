@@ -7,12 +7,14 @@ from copy import deepcopy
 
 import pytest
 import torch
+from mocks import lift_box
 from tensordict import TensorDictBase
 from test_training import config
 
 from hdmi.config import ConfigError
 from hdmi.learning import CheckpointError, Trainer, load_checkpoint
 from hdmi.learning.collectors import InlineCollector, ProcessCollector
+from hdmi.transforms import ResetNoiseCurriculum
 
 pytestmark = pytest.mark.xdist_group("collectors")  # its runs are made once, not in each process
 
@@ -59,6 +61,18 @@ def assert_from_policy(batch: TensorDictBase, actor: torch.nn.Module) -> None:
         loc, scale = actor.module[0].module(batch["policy"])
     torch.testing.assert_close(batch["loc"], loc, rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(batch["scale"], scale)
+
+
+def test_what_changes_with_time_does_so_in_workers_as_in_their_rank(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two ranks, each is through with its own half of the frames."""
+    for module in ("assembly", "learning.collectors"):
+        monkeypatch.setattr(f"hdmi.{module}.num_ranks", lambda: 2)
+    cfg = config("+lever=noise_curriculum", "total_frames=160")  # of 4 worlds: 20 steps on each of the ranks
+    collector = ProcessCollector(cfg, lift_box(), 0, num_workers=2, threads_per_worker=1)
+    monkeypatch.setattr("hdmi.assembly.num_ranks", lambda: 1)  # nobody has told the worker
+    for env in (collector.env, collector._make_envs[0]()):
+        (curriculum,) = (t for t in env.transform if isinstance(t, ResetNoiseCurriculum))
+        assert (curriculum.hold_steps, curriculum.grow_steps) == pytest.approx((8.0, 6.0))
 
 
 def test_batches_are_rows_of_contiguous_steps(trainer: Trainer) -> None:

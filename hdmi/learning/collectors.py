@@ -20,7 +20,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import BaseCollector, Collector, MultiSyncCollector
 from torchrl.modules import ProbabilisticActor
 
-from hdmi.assembly import Task, make_env
+from hdmi.assembly import Task, make_env, num_ranks
 from hdmi.config import ConfigError
 from hdmi.envs import ResetEnv
 from hdmi.learning.checkpoint import CheckpointError
@@ -151,7 +151,9 @@ class _WorkerCollector(ABC):
         self.threads = threads_per_worker or max(1, (cfg.num_threads or os.cpu_count() or 1) // num_workers)
         share = cfg.num_envs // num_workers
         self.env = make_env(cfg, share, task)
-        make = partial(_make_worker_env, cfg=cfg.copy(), task=task, num_envs=share, num_threads=self.threads)
+        own = cfg.copy()
+        own.total_frames //= num_ranks()  # a worker knows of no other rank, and some transforms count to the end
+        make = partial(_make_worker_env, cfg=own, task=task, num_envs=share, num_threads=self.threads)
         self._make_envs = [partial(make, seed=seed + _SEED_STRIDE * (i + 1)) for i in range(num_workers)]
         self._thread = ThreadPoolExecutor(max_workers=1)  # waits for the workers
         self._rollout: Future[TensorDictBase] | None = None
