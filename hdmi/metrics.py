@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+METRICS_FILE = "metrics.csv"  # in a run folder
+
 
 def read_rows(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     """Columns and rows of a metrics.csv; a last row that was written in part, as by a killed run, is left out.

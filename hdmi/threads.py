@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -26,6 +27,16 @@ def torch_threads(num_envs: int, envs_per_thread: int | None) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def share_of_processors(parts: int) -> int:
+    """Threads for each of so many processes that share the machine, at least 1.
+
+    Examples:
+        >>> share_of_processors(10**6)
+        1
+    """
+    return max(1, (os.cpu_count() or 1) // parts)
 
 
 def set_threads(count: int) -> None:

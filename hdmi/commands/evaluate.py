@@ -1,15 +1,16 @@
 """Evaluates a checkpoint by the paper's protocol; prints the figures and writes eval.json.
 
-    hdmi evaluate checkpoint=RUN [num_envs=256] [without=[NAME,...]] [terminations=all] [seed=0] ...
+    hdmi evaluate checkpoint=RUN [num_envs=256] [without=[NAME,...]] [terminations=all] [early_end=false] ...
     hdmi evaluate agent=zero|random [task=lift_box] [config_dir=FOLDER] ...
     hdmi evaluate policy=FILE.yaml task=NAME [motion_root=FOLDER] ...
 
 `checkpoint` is a run folder (its newest checkpoint counts) or a checkpoint file. `terminations` are those that end
 an episode as a failure: `all` that the policy was trained with, `none`, or a list such as
 [root_pose,object_pose]; `without` takes some of them away: without=[lost_contact] is the paper's evaluation of the
-interaction reward, on every task with contacts, without=[body_local_pose] that of the residual action. Errors are
-means over the steps survived, and as `..._horizon` over the whole motion, in which the world goes on after a failure.
-An agent instead of a checkpoint shows what a task is without a policy, in the environment of the default config;
+interaction reward, on every task with contacts, without=[body_local_pose] that of the residual action. With
+`early_end=true` what ended episodes early in the training (lever/early_end) ends them here, too. Errors are means over
+the steps survived, and as `..._horizon` over the whole motion, in which the world goes on after a failure. An agent
+instead of a checkpoint shows what a task is without a policy, in the environment of the default config;
 `policy` is the description of a network of others, which runs there with its own gains. Figures of these, and of an
 exported policy, are written only where `out` says.
 """
@@ -39,6 +40,7 @@ class Options:
     num_envs: int = 256
     terminations: list[str] = field(default_factory=lambda: ["all"])
     without: list[str] = field(default_factory=list)  # names of terminations
+    early_end: bool = False
     seed: int = 0
     task: str | None = None  # for an agent: lift_box; for a checkpoint: that it must be of; for a policy: needed
     motion_root: str | None = None  # instead of the training's
@@ -94,6 +96,7 @@ def evaluate(arguments: list[str], console: Console) -> int:
             options.num_threads,
             options.sim,
             without,
+            options.early_end,
         )
     console.print(result.table())
     if result.path is not None:

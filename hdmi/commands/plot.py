@@ -7,126 +7,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib.pyplot as plt
-import numpy as np
-from matplotlib.ticker import PercentFormatter
-
-from hdmi.metrics import read_rows
-
-# column -> label; shown are those that any run has
-CURVES = {
-    "episode_completed": "episodes completed",
-    "episode_steps": "episode length (steps)",
-    "joint_error": "joint error (rad)",
-    "body_error": "body error (m)",
-    "contact_rate": "contacts made",
-    "eval/success_rate": "success in evaluation",
-    "eval/survival": "survival in evaluation",
-}
-_SHARES = ("episode_completed", "contact_rate", "eval/success_rate", "eval/survival")
-_TIMES = ("frames", "minutes")
-_COLOURS = ("#2a6fbb", "#d1603d", "#3a8f5c", "#8a5bb0", "#c29a2b", "#4fa3a5", "#b5477d", "#6b6b6b")
-
-
-def read_metrics(run: Path) -> dict[str, np.ndarray]:
-    """Columns of a run's metrics.csv, NaN where nothing was logged; a row that is not complete is left out.
-
-    Raises:
-        FileNotFoundError: if there is none. ValueError: if it has no rows yet or is not of numbers.
-    """
-    path = run if run.is_file() else run / "metrics.csv"
-    if not path.is_file():
-        raise FileNotFoundError(f"{run}: no metrics.csv there")
-    fields, rows = read_rows(path)
-    if not rows:
-        raise ValueError(f"{path}: no rows yet")
-    if missing := [key for key in _TIMES if key not in fields]:
-        raise ValueError(f"{path}: no column {missing[0]!r}")
-    try:
-        return {key: np.array([float(row[key] or "nan") for row in rows]) for key in fields}
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-def labels_of(runs: Sequence[Path]) -> list[str]:
-    """Names of the run folders, with their parent's where names repeat."""
-    names = [run.resolve().name for run in runs]
-    return [
-        name if names.count(name) == 1 else f"{run.resolve().parent.name}/{name}"
-        for run, name in zip(runs, names, strict=True)
-    ]
-
-
-def smooth(values: np.ndarray, window: int) -> np.ndarray:
-    """Trailing mean over up to `window` rows, ignoring NaN."""
-    out = np.full_like(values, np.nan)
-    for i in range(len(values)):
-        part = values[max(i + 1 - window, 0) : i + 1]
-        if np.isfinite(values[i]):
-            out[i] = part[np.isfinite(part)].mean()
-    return out
-
-
-def plot_runs(runs: Sequence[Path], out: Path, window: int = 1) -> None:
-    """Draws the curves of all runs into a picture: one row per figure, against frames and against minutes.
-
-    A run without usable metrics.csv is told on the standard error output and left out.
-
-    Raises:
-        ValueError: if no run is left.
-    """
-    found: dict[Path, dict[str, np.ndarray]] = {}
-    problems: list[str] = []
-    for run in runs:
-        try:
-            found[run] = read_metrics(run)
-        except (OSError, ValueError) as error:
-            problems.append(str(error))
-    if not found:
-        raise ValueError("; ".join(problems))
-    for problem in problems:
-        print(f"left out: {problem}", file=sys.stderr)
-    runs, tables = list(found), list(found.values())
-    shown = [key for key in CURVES if any(np.isfinite(table.get(key, np.nan)).any() for table in tables)]
-    if not shown:
-        raise ValueError(f"none of the runs has any of {', '.join(CURVES)}")
-    figure, axes = plt.subplots(
-        len(shown), 2, figsize=(10, 2.1 * len(shown) + 0.6), sharex="col", sharey="row", squeeze=False
-    )
-    for table, label, i in zip(tables, labels_of(runs), range(len(tables)), strict=True):
-        for row, key in enumerate(shown):
-            if key not in table:
-                continue
-            y = smooth(table[key], window)
-            there = np.isfinite(y)
-            style = {"color": _COLOURS[i % len(_COLOURS)], "lw": 1.6, "marker": "o" if there.sum() < 30 else None}
-            for column, x in enumerate((table["frames"] / 1e6, table["minutes"])):
-                axes[row, column].plot(x[there], y[there], markersize=3, label=label, **style)
-    for row, key in enumerate(shown):
-        axes[row, 0].set_ylabel(CURVES[key])
-        if key in _SHARES:
-            axes[row, 0].yaxis.set_major_formatter(PercentFormatter(1.0))
-            axes[row, 0].set_ylim(-0.03, 1.03)
-        for ax in axes[row]:
-            ax.grid(alpha=0.3)
-            ax.spines[["top", "right"]].set_visible(False)
-    axes[-1, 0].set_xlabel("frames (million)")
-    axes[-1, 1].set_xlabel("minutes of training")
-    handles = {label: line for ax in axes.flat for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="upper center", ncols=min(len(handles), 3), frameon=False)
-    figure.align_ylabels()
-    figure.tight_layout(rect=(0, 0, 1, 1 - 0.35 * (1 + (len(handles) - 1) // 3) / figure.get_figheight()))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=130)
-    plt.close(figure)
+from hdmi.evaluation.curves import plot_runs
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the script; returns its exit status."""
-    plt.switch_backend("agg")
     parser = argparse.ArgumentParser("hdmi plot", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folder, or a metrics.csv")
     parser.add_argument("--out", type=Path, default=Path("curves.png"), help="picture to write (default: %(default)s)")

@@ -9,16 +9,23 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from hdmi.deploy.format import GRAPH_FILE, NETWORK_FILE, SCENE_FILE, SPEC_FILE
-from hdmi.evaluation.protocol import EvalResult, evaluate_checkpoint, unit_of
+from hdmi.evaluation.curves import plot_runs
+from hdmi.evaluation.protocol import EVAL_FILE, EvalResult, evaluate_checkpoint, has_early_end, unit_of
 from hdmi.evaluation.video import render_checkpoint
 from hdmi.learning import export_policy, load_checkpoint
 from hdmi.learning.checkpoint import POLICY_FILE
+from hdmi.metrics import METRICS_FILE, read_rows
 
-_SIZE = (240, 320)  # of the video, pixels
+CARD_FILE, EARLY_FILE = "README.md", "eval_early_end.json"
+_CURVE_FILE = "curve.png"
+_CURVES = {"eval/success_rate": "success in evaluation", "eval/survival": "survival in evaluation"}
 
 
 def export(run_or_checkpoint: str | Path, folder: str | Path, num_envs: int = 256, seed: int = 0) -> Path:
     """Writes policy.pt, config.yaml, eval.json, video.mp4 and README.md, evaluated and rendered from that policy.pt.
+
+    Of a policy that was trained with early ends also eval_early_end.json, in which they end episodes, too; of a run
+    that was evaluated on the way curve.png.
 
     Args:
         run_or_checkpoint: a run folder (its newest checkpoint counts) or a checkpoint file.
@@ -34,20 +41,44 @@ def export(run_or_checkpoint: str | Path, folder: str | Path, num_envs: int = 25
     policy = export_policy(run_or_checkpoint, folder / POLICY_FILE)
     state = load_checkpoint(policy)
     OmegaConf.save(OmegaConf.create(state["config"]), folder / "config.yaml")
-    result = evaluate_checkpoint(policy, num_envs, seed=seed, out=folder / "eval.json")
-    render_checkpoint(policy, seed=seed, size=_SIZE)
-    (folder / "README.md").write_text(_card(state, result, folder, seed), encoding="utf-8")
+    results = [evaluate_checkpoint(policy, num_envs, seed=seed, out=folder / EVAL_FILE)]
+    if has_early_end(OmegaConf.create(state["config"])):
+        early = evaluate_checkpoint(policy, num_envs, seed=seed, out=folder / EARLY_FILE, early_end=True)
+        results.append(early)
+    else:
+        (folder / EARLY_FILE).unlink(missing_ok=True)  # of an earlier policy
+    render_checkpoint(policy, seed=seed)
+    curve = _plot_curve(Path(run_or_checkpoint), folder / _CURVE_FILE)
+    (folder / CARD_FILE).write_text(_card(state, results, folder, seed, curve), encoding="utf-8")
     return folder
 
 
-def _card(state: dict, result: EvalResult, folder: Path, seed: int) -> str:
+def _plot_curve(run: Path, path: Path) -> bool:
+    """Draws how evaluations went during a training; False if the run has none, and then none from before stays."""
+    metrics = run / METRICS_FILE
+    rows = read_rows(metrics)[1] if metrics.is_file() else []
+    there = any(row.get(key) for row in rows for key in _CURVES)
+    if there:
+        plot_runs([metrics], path, curves=_CURVES)
+    elif run.resolve() != path.parent.resolve():
+        path.unlink(missing_ok=True)
+    return path.is_file()
+
+
+def _card(state: dict, results: list[EvalResult], folder: Path, seed: int, curve: bool) -> str:
     """The text of README.md."""
-    config = state["config"]
-    command = " ".join(["hdmi train", *config.get("overrides", ())])
-    rows = [f"| {name} | {_shown(name, value['mean'])} |" for name, value in result.figures().items()]
-    for name, share in result["termination_causes"].items():
-        if share:
-            rows.append(f"| failed by {name} | {100 * share:.1f} %, median frame {result['failure_frames'][name]:g} |")
+    config, result = state["config"], results[0]
+    own = ("output_dir=", "run_name=", "resume=")  # where it ran is nobody else's business
+    command = " ".join(["hdmi train", *(text for text in config.get("overrides", ()) if not text.startswith(own))])
+    figures = [one.figures() for one in results]
+    rows = [
+        f"| {name} | {' | '.join(_shown(name, one[name]['mean']) if name in one else '' for one in figures)} |"
+        for name in figures[0]
+    ]
+    for name in dict.fromkeys(cause for one in results for cause in one["termination_causes"]):
+        if any(one["termination_causes"].get(name) for one in results):
+            rows.append(f"| failed by {name} | {' | '.join(_failed(one, name) for one in results)} |")
+    headings = ["training's terminations", "and its early ends"][: len(results)]
     lines = [
         f"# {state['task']}",
         "",
@@ -63,14 +94,24 @@ def _card(state: dict, result: EvalResult, folder: Path, seed: int) -> str:
         "",
         *_graph_lines(folder),
         f"`policy.pt` holds the weights and the observations' normalization ({_megabytes(folder / POLICY_FILE)} MB); "
-        "`config.yaml` is the whole config of the training, `eval.json` the evaluation from the first frame, under the "
-        "training's reset noise and randomization:",
+        f"`config.yaml` is the whole config of the training, `{EVAL_FILE}` the evaluation from the first frame, under "
+        "the training's reset noise and randomization"
+        + f", `{EARLY_FILE}` one in which what ended training episodes early ends them, too" * (len(results) > 1)
+        + ":",
         "",
-        f"| {result['num_envs']} episodes | mean |",
-        "|---|---|",
+        f"| {result['num_envs']} episodes | {' | '.join(headings)} |",
+        "|---" * (1 + len(results)) + "|",
         *rows,
     ]
+    if curve:
+        lines += ["", f"![success and survival in evaluations during the training]({_CURVE_FILE})"]
     return "\n".join(lines) + "\n"
+
+
+def _failed(result: EvalResult, cause: str) -> str:
+    """How often a termination ended episodes, and when."""
+    share = result["termination_causes"].get(cause)
+    return f"{100 * share:.1f} %, median frame {result['failure_frames'][cause]:g}" if share else ""
 
 
 def _graph_lines(folder: Path) -> list[str]:

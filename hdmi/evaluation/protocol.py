@@ -51,6 +51,7 @@ UNITS = {
     "object_ori_error": "rad",
     "object_joint_error": "rad",
 }
+EVAL_FILE = "eval.json"  # in a run folder, or beside an exported policy
 HORIZON = "_horizon"  # of errors over the whole motion, survived or not
 _MADE, _INTENDED = "contact_made", "contact_intended"
 _DIVERGED, _OTHER = "diverged", "other"
@@ -62,7 +63,11 @@ def unit_of(figure: str) -> str:
 
 
 def evaluation_config(
-    cfg: DictConfig, terminations: Sequence[str] | None = None, start: int = 0, without: Sequence[str] = ()
+    cfg: DictConfig,
+    terminations: Sequence[str] | None = None,
+    start: int = 0,
+    without: Sequence[str] = (),
+    early_end: bool = False,
 ) -> DictConfig:
     """The training config changed to the protocol; reset noise, randomization and observation noise stay, aids go.
 
@@ -71,9 +76,10 @@ def evaluation_config(
         start: frame of the reference that episodes start from.
         without: names of terminations that do not, whatever `terminations` says. The task must have them; a training
             may have gone without.
+        early_end: let what ended episodes early in the training end them here, too, as terminations.
 
     Raises:
-        ConfigError: for a termination that the config does not have.
+        ConfigError: for a termination that the config does not have, or early ends that it does not have.
     """
     cfg = copy.deepcopy(cfg)
     with open_dict(cfg):
@@ -82,6 +88,10 @@ def evaluation_config(
         kept = {key: value for key, value in node.items() if key in inspect.signature(cls).parameters}
         state = kept | {"start": start, "first_share": 0.0, "_target_": f"{cls.__module__}.{cls.__qualname__}"}
         cfg.reset = {"state": state}
+        if early_end:
+            if not has_early_end(cfg):
+                raise ConfigError("early_end: the policy was trained without early ends")
+            cfg.termination = {**(cfg.termination or {}), **cfg.early_end}
         cfg.early_end, cfg.assist = {}, {}
         known = termination_names(cfg)
         if unknown := [name for name in terminations or () if name not in known]:
@@ -92,6 +102,11 @@ def evaluation_config(
             if name in without or (terminations is not None and name not in terminations):
                 cfg.termination[name] = None
     return cfg
+
+
+def has_early_end(cfg: DictConfig) -> bool:
+    """Whether episodes of a training ended earlier than by its terminations."""
+    return any(node is not None for node in (cfg.get("early_end") or {}).values())
 
 
 def termination_names(cfg: DictConfig) -> list[str]:
@@ -329,6 +344,7 @@ def evaluate_policy(
     seed: int = 0,
     without: Sequence[str] = (),
     whole_motion: bool = True,
+    early_end: bool = False,
 ) -> EvalResult:
     """Evaluates an actor under the conditions it was trained with.
 
@@ -343,11 +359,12 @@ def evaluate_policy(
         seed: of start states, randomization and noise. The caller's random state is left alone.
         without: names of terminations that do not end episodes.
         whole_motion: measure errors over the whole motion, too; without, it ends with the last episode.
+        early_end: let what ended episodes early in the training end them here, too.
 
     Raises:
         ConfigError: for a termination that the config does not have, or a config that cannot be built.
     """
-    cfg = evaluation_config(cfg, terminations, without=without)
+    cfg = evaluation_config(cfg, terminations, without=without, early_end=early_end)
     task = make_task(cfg) if task is None else task
     causes = termination_names(cfg)
     horizon = task.reference.num_frames - 1
@@ -392,6 +409,7 @@ def evaluate_checkpoint(
     num_threads: int | None = None,
     sim: str | None = None,
     without: Sequence[str] = (),
+    early_end: bool = False,
 ) -> EvalResult:
     """Evaluates a checkpoint by `evaluate_policy` and writes eval.json, which its result then names as `path`.
 
@@ -403,6 +421,7 @@ def evaluate_checkpoint(
         motion_root, num_threads: instead of the training's.
         sim: engine (`cpu`, `gpu`) instead of the training's.
         without: names of terminations that do not end episodes.
+        early_end: let what ended episodes early in the training end them here, too.
 
     Raises:
         CheckpointError: if there is no usable checkpoint, or it is of another task.
@@ -416,7 +435,9 @@ def evaluate_checkpoint(
         cfg.num_threads = num_threads
     if sim is not None:
         choose_engine(cfg, sim)
-    values = evaluate_policy(actor, cfg, num_envs, terminations=terminations, seed=seed, without=without)
+    values = evaluate_policy(
+        actor, cfg, num_envs, terminations=terminations, seed=seed, without=without, early_end=early_end
+    )
     file = Path(info["file"])
     folder = run_folder_of(file)
     origin = {
@@ -426,7 +447,7 @@ def evaluate_checkpoint(
     }
     result = EvalResult({**values, **origin})
     if out is None and file.name != POLICY_FILE:
-        out = folder / "eval.json"
+        out = folder / EVAL_FILE
     if out is not None:
         result.save(out)
     return result

@@ -30,6 +30,7 @@ from hdmi.evaluation.protocol import (
 )
 from hdmi.motion import reference_qpos
 
+VIDEO_FILE = "video.mp4"  # in a run folder, or beside an exported policy
 SIZE = (480, 640)  # height, width
 AFTER_FAILURE = 1.0  # s that are still shown
 
@@ -330,5 +331,5 @@ def render_checkpoint(
         cfg.motion_root = motion_root
     built = make_task(cfg)
     moments = every(play_moments(cfg, built, actor, start, seed), stride)
-    path = run_folder_of(Path(info["file"])) / "video.mp4" if path is None else path
+    path = run_folder_of(Path(info["file"])) / VIDEO_FILE if path is None else path
     return write_video(path, moments, Overlay(built), 1 / (built.scene.sim.control_dt * stride), size)

@@ -9,6 +9,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from hdmi.threads import share_of_processors
+
 _SEED_STRIDE = 2**20  # between ranks, so that runs of neighbouring seeds share none
 
 
@@ -52,7 +54,7 @@ class Ranks:
 
     def threads(self, count: int) -> int:
         """Threads of this rank: those asked for, or its share of the machine's processors; 0 leaves the choice."""
-        return count or (0 if self.local_size == 1 else max(1, (os.cpu_count() or 1) // self.local_size))
+        return count or (0 if self.local_size == 1 else share_of_processors(self.local_size))
 
     def mean(self, value: Tensor) -> Tensor:
         """Mean over ranks, the same on all of them."""

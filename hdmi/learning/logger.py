@@ -11,7 +11,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from hdmi.metrics import read_rows
+from hdmi.metrics import METRICS_FILE, read_rows
 
 _ID_FILE = "wandb_id.txt"  # of the run in W&B, the same for all its continuations
 _TAGGED = ("ablation", "preset")  # groups whose choice is a tag
@@ -36,7 +36,7 @@ class RunLogger:
     """
 
     def __init__(self, folder: Path, cfg: DictConfig, last_iteration: int = 0):
-        self.path = folder / "metrics.csv"
+        self.path = folder / METRICS_FILE
         self.lost_rows = 0
         self.iteration = last_iteration
         self._fields: list[str] = []
