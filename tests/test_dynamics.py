@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
+import torch
 
+from hdmi.assembly import make_task
 from hdmi.assets import default_joint_pos, g1, g1_robot
+from hdmi.config import task_config
+from hdmi.evaluation.agents import blind_agent
+from hdmi.evaluation.protocol import evaluation_config, make_evaluation_env
 from hdmi.motion import Motion, forward_kinematics, make_playback
 from hdmi.motion.dynamics import inverse_dynamics, reference_torque
 from hdmi.motion.format import motion_from_poses
@@ -114,7 +120,26 @@ def test_torques_of_a_reference_are_smooth(monkeypatch: pytest.MonkeyPatch):
     still = reference_torque(playback.scene, playback.reference)
     np.testing.assert_allclose(still, inverse_dynamics(playback).torque, atol=0.2)
     jump = np.repeat((np.arange(40) >= 20)[:, None] * 100.0, 29, axis=1)  # N m
-    monkeypatch.setattr("hdmi.motion.dynamics.inverse_dynamics", lambda _: SimpleNamespace(torque=jump))
+    monkeypatch.setattr("hdmi.motion.dynamics.inverse_dynamics", lambda _, grips: SimpleNamespace(torque=jump))
     smooth = reference_torque(playback.scene, playback.reference)
     assert np.diff(smooth[:, 0]).max() == pytest.approx(100 / (2 * math.sqrt(2 * math.pi)), rel=0.02)
     np.testing.assert_allclose(smooth[[0, -1]], jump[[0, -1]], atol=1e-3)
+
+
+def test_torques_of_a_grip_hold_the_object(monkeypatch: pytest.MonkeyPatch):
+    """From the middle of carrying, without noise, servos that follow the reference keep the suitcase for a while."""
+    cfg = evaluation_config(task_config("move_suitcase"), start=272)
+    cfg.num_threads, cfg.randomization, cfg.reset.state.noise = 1, None, {}
+    lost, torques = {}, {}
+    for grips in (True, False):
+        bare = partial(inverse_dynamics, grips=grips)
+        monkeypatch.setattr("hdmi.motion.dynamics.inverse_dynamics", lambda playback, grips, bare=bare: bare(playback))
+        task = make_task(cfg)
+        torques[grips] = task.joint_torque
+        env = make_evaluation_env(cfg, task, 1)
+        steps = env.rollout(25, blind_agent("zero", cfg, task), break_when_any_done=False)["next"]
+        lost[grips] = float(steps["metrics", "object_pos_error"][0, -1])
+        env.close()
+    assert lost[True] < 0.5 * lost[False], lost
+    effort = torch.tensor(task.scene.robot.effort_limits)
+    assert (torques[True].abs() <= 1.01 * effort).all()

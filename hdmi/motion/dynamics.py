@@ -19,6 +19,8 @@ _SLIDING = 0.05  # m/s; from here on friction of an object opposes its sliding
 _UNSUPPORTED = 0.1  # body weights; with more than this missing there is no support to find a centre of pressure in
 _GRAVITY = 9.81
 _PATCH = 0.04  # m; radius of the patch in which a hand touches an object: it resists turning about the normal
+_GRIP = 0.5  # of the friction that a grip counts on: objects differ from world to world
+_BARE = 0.3  # price of a force that is no grip, against one that is missing
 _LEVER = 1.0  # m; lever arm that weighs moments against forces, on the robot
 _OBJECT_LEVER = 0.3  # m; likewise on the object
 _EASE = 0.03  # weight of small torques against the balance of forces
@@ -50,9 +52,15 @@ class Dynamics:
     object_force: np.ndarray  # [T] that nothing gives the object, in its weights; NaN without a free object
 
 
-def inverse_dynamics(playback: Playback) -> Dynamics:
-    """Explains a motion by forces of contacts, see `Dynamics`; they bridge the `ground_gap`."""
-    solver = _Solver(playback, min(playback.ground_gap, _REACH - TOUCH))
+def inverse_dynamics(playback: Playback, grips: bool = False) -> Dynamics:
+    """Explains a motion by forces of contacts, see `Dynamics`; they bridge the `ground_gap`.
+
+    Args:
+        grips: whether effectors hold the object by pressing it, with half of its friction, as far as that explains the
+            motion. Any bare force that the object needs asks for the least torques, but these let go of what is held
+            between two hands.
+    """
+    solver = _Solver(playback, min(playback.ground_gap, _REACH - TOUCH), grips)
     qvel, qacc = playback.derivatives()
     rows = [solver.solve(t, qvel[t], qacc[t]) for t in range(playback.num_frames)]
     return Dynamics(*(np.array(column) for column in zip(*rows, strict=True)))
@@ -61,17 +69,25 @@ def inverse_dynamics(playback: Playback) -> Dynamics:
 def reference_torque(scene: Scene, reference: Reference) -> np.ndarray:
     """Joint torques that a reference asks for in its scene, N m, smoothed over some frames. [T, J]
 
-    See `inverse_dynamics`; contacts that switch from one frame to the next make its torques jump.
+    See `inverse_dynamics`, with grips; contacts that switch from one frame to the next make its torques jump.
     """
     reference = reference.to("cpu")
     playback = Playback(reference, scene, reference_qpos(scene, reference), 1 / scene.sim.control_dt)
-    smooth: np.ndarray = gaussian_filter1d(inverse_dynamics(playback).torque, _SMOOTHING, axis=0, mode="nearest")
+    torque = inverse_dynamics(playback, grips=True).torque
+    smooth: np.ndarray = gaussian_filter1d(torque, _SMOOTHING, axis=0, mode="nearest")
     return smooth
 
 
 class _Solver:
-    def __init__(self, playback: Playback, ground_gap: float):
-        self.playback, self.ground_gap = playback, ground_gap
+    """Explains frames of a motion.
+
+    Args:
+        ground_gap: between feet and ground that forces bridge, m.
+        grips: whether effectors press and hold the object by friction, rather than give it any force.
+    """
+
+    def __init__(self, playback: Playback, ground_gap: float, grips: bool):
+        self.playback, self.ground_gap, self.grips = playback, ground_gap, grips
         scene = playback.scene
         model = copy(scene.model)
         model.geom_margin[:] = model.body_margin[:] = _REACH / 2  # margins of a pair add up
@@ -99,6 +115,7 @@ class _Solver:
             self.row_weight[v + 3 : v + 6] = 1 / (self.object_weight * _OBJECT_LEVER)
         if (v := scene.object_hinge_dof) is not None:
             self.row_weight[v] = 1 / (weight * _LEVER)
+        self.bare_price = _BARE / (self.object_weight or weight) if grips else 0.0
 
     def solve(self, t: int, qvel: np.ndarray, qacc: np.ndarray) -> tuple[np.ndarray, float, bool, float, float]:
         model, data, scene = self.model, self.data, self.playback.scene
@@ -109,7 +126,7 @@ class _Solver:
         model.opt.disableflags &= ~constraint
         mujoco.mj_collision(model, data)
         needed = data.qfrc_inverse.copy()
-        left = self._explain(needed, self._generators(t))
+        left = self._explain(needed, *self._generators(t))
         lifted = max(float(np.linalg.norm(needed[:3])), 1e-9)
         missing = float(np.linalg.norm(left[:3])) / self.weight
         in_flight = needed[2] < 0.2 * self.weight
@@ -119,19 +136,22 @@ class _Solver:
             object_force = float(np.linalg.norm(left[v : v + 3])) / self.object_weight
         return left[scene.joint_dof], missing, bool(in_flight), cop, object_force
 
-    def _explain(self, needed: np.ndarray, generators: np.ndarray) -> np.ndarray:
+    def _explain(self, needed: np.ndarray, generators: np.ndarray, price: np.ndarray) -> np.ndarray:
         """What contact forces leave of the needed generalised forces. [nv]
 
-        Torques beyond the effort limits are held to them, where contacts can do that, and balance suffers instead.
+        Forces have a price each. Torques beyond the effort limits are held to them, where contacts can do that, and
+        balance suffers instead.
         """
         if not generators.size:
             return needed
         weight, target = self.row_weight.copy(), needed.copy()
         dofs, effort = self.playback.scene.joint_dof, self.effort
         held, left = np.zeros(len(dofs), bool), needed
+        prices, nothing = np.diag(price)[price > 0], np.zeros((price > 0).sum())
         while True:
             try:
-                forces, _ = nnls(weight[:, None] * generators, weight * target, maxiter=1000)
+                rows = np.vstack([weight[:, None] * generators, prices])
+                forces, _ = nnls(rows, np.concatenate([weight * target, nothing]), maxiter=1000)
             except RuntimeError:  # cycles between degenerate solutions: explained no better than before
                 return left
             left = needed - generators @ forces
@@ -144,10 +164,11 @@ class _Solver:
             held |= beyond
         return left
 
-    def _generators(self, t: int) -> np.ndarray:
-        """Generalised forces of the edges of all friction cones. [nv, K]"""
+    def _generators(self, t: int) -> tuple[np.ndarray, np.ndarray]:
+        """Generalised forces of the edges of all friction cones, and what each costs. [nv, K], [K]"""
         model, data = self.model, self.data
-        columns = []
+        columns: list[np.ndarray] = []
+        prices: list[float] = []
         lin1, lin2, ang1, ang2 = np.zeros((4, 3, model.nv))
         for contact in data.contact:
             first, second = int(contact.geom[0]), int(contact.geom[1])
@@ -163,14 +184,24 @@ class _Solver:
             speed = np.linalg.norm(slip)
             if self._intended(t, first, second):
                 turning = _PATCH * (ang2 - ang1).T @ normal
-                columns += [sign * column for column in (*jacobian, turning) for sign in (1, -1)]
+                bare = [sign * column for column in (*jacobian, turning) for sign in (1, -1)]
+                columns += bare
+                prices += [self.bare_price] * len(bare)
+                if self.grips:
+                    edges = [*(jacobian.T @ tangent for tangent in frame[1:]), turning]
+                    pressed = jacobian.T @ normal
+                    cone = [pressed + sign * _GRIP * friction * edge for edge in edges for sign in (1, -1)]
+                    columns += cone
+                    prices += [0.0] * len(cone)
                 continue
             if speed > _SLIDING and not (self.robot[first] or self.robot[second]):
                 directions = [normal - friction * slip / speed]
             else:
                 directions = [normal + sign * friction * tangent for tangent in frame[1:] for sign in (1, -1)]
             columns += [jacobian.T @ direction for direction in directions]
-        return np.stack(columns, axis=1) if columns else np.zeros((model.nv, 0))
+            prices += [0.0] * len(directions)
+        generators = np.stack(columns, axis=1) if columns else np.zeros((model.nv, 0))
+        return generators, np.array(prices)
 
     def _intended(self, t: int, first: int, second: int) -> bool:
         """Whether two geoms are an effector and the object that it is to touch now."""
