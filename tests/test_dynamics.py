@@ -127,8 +127,8 @@ def test_torques_of_a_reference_are_smooth(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_torques_of_a_grip_hold_the_object(monkeypatch: pytest.MonkeyPatch):
-    """From the middle of carrying, without noise, servos that follow the reference keep the suitcase for a while."""
-    cfg = evaluation_config(task_config("move_suitcase"), start=272)
+    """From the middle of carrying, without noise, servos that follow the reference keep the box."""
+    cfg = evaluation_config(task_config("carry_bread_box"), start=225)
     cfg.num_threads, cfg.randomization, cfg.reset.state.noise = 1, None, {}
     lost, torques = {}, {}
     for grips in (True, False):
@@ -140,6 +140,6 @@ def test_torques_of_a_grip_hold_the_object(monkeypatch: pytest.MonkeyPatch):
         steps = env.rollout(25, blind_agent("zero", cfg, task), break_when_any_done=False)["next"]
         lost[grips] = float(steps["metrics", "object_pos_error"][0, -1])
         env.close()
-    assert lost[True] < 0.5 * lost[False], lost
+    assert lost[True] < 0.3 * lost[False], lost
     effort = torch.tensor(task.scene.robot.effort_limits)
     assert (torques[True].abs() <= 1.01 * effort).all()

@@ -20,6 +20,7 @@ _UNSUPPORTED = 0.1  # body weights; with more than this missing there is no supp
 _GRAVITY = 9.81
 _PATCH = 0.04  # m; radius of the patch in which a hand touches an object: it resists turning about the normal
 _GRIP = 0.5  # of the friction that a grip counts on: objects differ from world to world
+_AT_ONCE = 0.01  # m; what is farther off than the nearest surface is not pressed with it
 _BARE = 0.3  # price of a force that is no grip, against one that is missing
 _LEVER = 1.0  # m; lever arm that weighs moments against forces, on the robot
 _OBJECT_LEVER = 0.3  # m; likewise on the object
@@ -170,6 +171,11 @@ class _Solver:
         columns: list[np.ndarray] = []
         prices: list[float] = []
         lin1, lin2, ang1, ang2 = np.zeros((4, 3, model.nv))
+        nearest: dict[int, float] = {}  # effector -> m, to the object
+        for contact in data.contact:
+            effector = self._intended(t, *map(int, contact.geom))
+            if effector is not None:
+                nearest[effector] = min(nearest.get(effector, np.inf), contact.dist)
         for contact in data.contact:
             first, second = int(contact.geom[0]), int(contact.geom[1])
             if (self.robot[first] and self.robot[second]) or contact.dist > self._reach(t, first, second):
@@ -182,12 +188,12 @@ class _Solver:
             slip = jacobian @ data.qvel
             slip -= normal * (normal @ slip)
             speed = np.linalg.norm(slip)
-            if self._intended(t, first, second):
+            if (effector := self._intended(t, first, second)) is not None:
                 turning = _PATCH * (ang2 - ang1).T @ normal
                 bare = [sign * column for column in (*jacobian, turning) for sign in (1, -1)]
                 columns += bare
                 prices += [self.bare_price] * len(bare)
-                if self.grips:
+                if self.grips and contact.dist < nearest[effector] + _AT_ONCE:
                     edges = [*(jacobian.T @ tangent for tangent in frame[1:]), turning]
                     pressed = jacobian.T @ normal
                     cone = [pressed + sign * _GRIP * friction * edge for edge in edges for sign in (1, -1)]
@@ -203,15 +209,16 @@ class _Solver:
         generators = np.stack(columns, axis=1) if columns else np.zeros((model.nv, 0))
         return generators, np.array(prices)
 
-    def _intended(self, t: int, first: int, second: int) -> bool:
-        """Whether two geoms are an effector and the object that it is to touch now."""
+    def _intended(self, t: int, first: int, second: int) -> int | None:
+        """The effector, if two geoms are one and the object that it is to touch now."""
         robot, other = (first, second) if self.robot[first] else (second, first)
         effector = self.effector_of_body.get(int(self.model.geom_bodyid[robot]))
-        return effector is not None and bool(self.object[other]) and bool(self.contact[t, effector])
+        touches = effector is not None and self.object[other] and self.contact[t, effector]
+        return effector if touches else None
 
     def _reach(self, t: int, first: int, second: int) -> float:
         """Up to which distance two geoms can push each other, m."""
-        if self._intended(t, first, second):
+        if self._intended(t, first, second) is not None:
             return _REACH
         on_ground = (self.robot[first] or self.robot[second]) and not (self.object[first] or self.object[second])
         return self.ground_gap + TOUCH if on_ground else TOUCH
