@@ -17,12 +17,12 @@ from tensordict import TensorDict
 
 from hdmi.assembly import make_env, make_transforms
 from hdmi.assets import g1
-from hdmi.config import ConfigError
+from hdmi.config import ConfigError, task_config
 from hdmi.envs.rendering import RenderingError, WorldRenderer
 from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy, protocol, render_checkpoint, video
 from hdmi.evaluation.agents import BlindAgent, blind_agent
 from hdmi.evaluation.curves import read_metrics
-from hdmi.evaluation.protocol import FirstEpisodes, evaluation_config, termination_names
+from hdmi.evaluation.protocol import FirstEpisodes, conditions, evaluation_config, task_starts_config, termination_names
 from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from hdmi.learning.policy import load_policy, make_networks
 from hdmi.transforms import ReferenceStateInitialization
@@ -422,6 +422,26 @@ def test_an_exported_policy_acts_like_its_checkpoint(
     assert "after 96 frames, 2 minutes" in card
     assert "policy.onnx" in card
     assert f"| survival | {100 * figures['survival']['mean']:.1f} % |" in card
+
+
+def test_early_ends_and_the_tasks_starts_are_conditions_of_their_own():
+    plain, close = task_config("walk"), task_config("push_door_hand")
+    close.reset.state.noise.root_pos = [0.02, 0.02, 0.005]
+    assert list(conditions(plain)) == ["training", "early_end"]
+    assert list(conditions(close)) == ["training", "early_end", "task_starts"]
+    assert list(conditions(task_config("lift_box"))) == ["training"]
+    assert set(termination_names(evaluation_config(plain))) == {"root_pose", "body_local_pose"}
+    strict = evaluation_config(plain, early_end=True)
+    assert set(termination_names(strict)) == {"root_pose", "body_local_pose", "early_root_pose", "early_body_pose"}
+    assert list(strict.termination.early_root_pose.thresholds) == [0.5, 0.8]
+    assert list(task_starts_config(close).reset.state.noise.root_pos) == [0.2, 0.2, 0.01]
+    with pytest.raises(ConfigError, match="trained without early ends"):
+        evaluation_config(task_config("lift_box"), early_end=True)
+
+
+def test_only_a_checkpoint_has_early_ends(capsys: pytest.CaptureFixture[str]):
+    assert command("evaluate").main(["agent=zero", "early_end=true"]) == 2
+    assert "only a checkpoint" in capsys.readouterr().err
 
 
 def test_export_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

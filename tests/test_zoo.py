@@ -206,7 +206,7 @@ def test_a_zoo_is_trained_and_shown(tmp_path: Path, capsys: pytest.CaptureFixtur
         "policy.pt", "config.yaml", "eval.json", "eval_early_end.json", "curve.png", "video.mp4", "README.md",
     }  # fmt: skip
     card = (zoo / "stroll" / "README.md").read_text()
-    assert "and its early ends" in card
+    assert "its early ends, too" in card
     assert str(tmp_path / "runs") not in card
     page, sheet = tmp_path / "zoo.md", tmp_path / "zoo.jpg"
     assert tasks.main(["zoo", f"markdown={page}", f"sheet={sheet}", *places]) == 0
@@ -220,15 +220,14 @@ def test_a_zoo_is_trained_and_shown(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_the_table_says_what_fails():
-    entries = [
-        Entry("walk", 3_000_000, 16.4, evaluation(0.75, 0.9), evaluation(0.7)),
-        Entry("run", 10, 1, evaluation(1.0)),
-    ]
+    walks = {"training": evaluation(0.75, 0.9), "early_end": evaluation(0.7), "task_starts": evaluation(0.5)}
+    entries = [Entry("walk", 3_000_000, 16.4, walks), Entry("run", 10, 1, {"training": evaluation(1.0)})]
     first, second = zoo_rows(entries)
     assert first == [
-        "walk", "3.0 M", "16", "75.0 %", "90.0 %", "70.0 %", "0.050", "3.0", "", "root_pose 25.0 % (frame 80)",
+        "walk", "3.0 M", "16", "75.0 %", "90.0 %", "70.0 %", "50.0 %", "0.050", "3.0", "",
+        "root_pose 25.0 % (frame 80)",
     ]  # fmt: skip
-    assert (second[5], second[9]) == ("", "")
+    assert (second[5], second[6], second[10]) == ("", "", "")
     lines = zoo_markdown(entries, "../zoo").splitlines()
     assert lines[2].startswith("| [`walk`](../zoo/walk) | 3.0 M | 16 |")
     assert len({line.count("|") for line in lines}) == 1

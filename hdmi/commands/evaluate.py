@@ -8,9 +8,10 @@
 an episode as a failure: `all` that the policy was trained with, `none`, or a list such as
 [root_pose,object_pose]; `without` takes some of them away: without=[lost_contact] is the paper's evaluation of the
 interaction reward, on every task with contacts, without=[body_local_pose] that of the residual action. With
-`early_end=true` what ended episodes early in the training (lever/early_end) ends them here, too. Errors are means over
-the steps survived, and as `..._horizon` over the whole motion, in which the world goes on after a failure. An agent
-instead of a checkpoint shows what a task is without a policy, in the environment of the default config;
+`early_end=true` what ended episodes early in the training (lever/early_end) ends them here, too;
+`task_starts=true` takes the reset noise of the task instead of the training's (lever=close_starts). Errors are means
+over the steps survived, and as `..._horizon` over the whole motion, in which the world goes on after a failure. An
+agent instead of a checkpoint shows what a task is without a policy, in the environment of the default config;
 `policy` is the description of a network of others, which runs there with its own gains. Figures of these, and of an
 exported policy, are written only where `out` says.
 """
@@ -40,7 +41,8 @@ class Options:
     num_envs: int = 256
     terminations: list[str] = field(default_factory=lambda: ["all"])
     without: list[str] = field(default_factory=list)  # names of terminations
-    early_end: bool = False
+    early_end: bool = False  # of a checkpoint
+    task_starts: bool = False  # of a checkpoint
     seed: int = 0
     task: str | None = None  # for an agent: lift_box; for a checkpoint: that it must be of; for a policy: needed
     motion_root: str | None = None  # instead of the training's
@@ -83,6 +85,8 @@ def evaluate(arguments: list[str], console: Console) -> int:
         raise ConfigError(f"num_envs: expected at least 1, got {options.num_envs}")
     terminations, without = parse_terminations(options.terminations), options.without
     if options.checkpoint is None:
+        if options.early_end or options.task_starts:
+            raise ConfigError("early_end, task_starts: only a checkpoint has had a training to differ from")
         result = evaluate_in_task(options, terminations, without)
     else:
         result = evaluate_checkpoint(
@@ -97,6 +101,7 @@ def evaluate(arguments: list[str], console: Console) -> int:
             options.sim,
             without,
             options.early_end,
+            options.task_starts,
         )
     console.print(result.table())
     if result.path is not None:

@@ -6,17 +6,22 @@ import os
 import platform
 from pathlib import Path
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from hdmi.deploy.format import GRAPH_FILE, NETWORK_FILE, SCENE_FILE, SPEC_FILE
 from hdmi.evaluation.curves import plot_runs
-from hdmi.evaluation.protocol import EVAL_FILE, EvalResult, evaluate_checkpoint, has_early_end, unit_of
+from hdmi.evaluation.protocol import EVAL_FILE, EvalResult, conditions, evaluate_checkpoint, unit_of
 from hdmi.evaluation.video import render_checkpoint
 from hdmi.learning import export_policy, load_checkpoint
 from hdmi.learning.checkpoint import POLICY_FILE
 from hdmi.metrics import METRICS_FILE, read_rows
 
-CARD_FILE, EARLY_FILE = "README.md", "eval_early_end.json"
+CARD_FILE = "README.md"
+_HEADINGS = {
+    "training": "training's terminations and starts",
+    "early_end": "its early ends, too",
+    "task_starts": "the task's reset noise",
+}
 _CURVE_FILE = "curve.png"
 _CURVES = {"eval/success_rate": "success in evaluation", "eval/survival": "survival in evaluation"}
 
@@ -24,8 +29,8 @@ _CURVES = {"eval/success_rate": "success in evaluation", "eval/survival": "survi
 def export(run_or_checkpoint: str | Path, folder: str | Path, num_envs: int = 256, seed: int = 0) -> Path:
     """Writes policy.pt, config.yaml, eval.json, video.mp4 and README.md, evaluated and rendered from that policy.pt.
 
-    Of a policy that was trained with early ends also eval_early_end.json, in which they end episodes, too; of a run
-    that was evaluated on the way curve.png.
+    Where there are other conditions to judge it by (`protocol.conditions`) also eval_early_end.json and
+    eval_task_starts.json; of a run that was evaluated on the way curve.png.
 
     Args:
         run_or_checkpoint: a run folder (its newest checkpoint counts) or a checkpoint file.
@@ -41,16 +46,21 @@ def export(run_or_checkpoint: str | Path, folder: str | Path, num_envs: int = 25
     policy = export_policy(run_or_checkpoint, folder / POLICY_FILE)
     state = load_checkpoint(policy)
     OmegaConf.save(OmegaConf.create(state["config"]), folder / "config.yaml")
-    results = [evaluate_checkpoint(policy, num_envs, seed=seed, out=folder / EVAL_FILE)]
-    if has_early_end(OmegaConf.create(state["config"])):
-        early = evaluate_checkpoint(policy, num_envs, seed=seed, out=folder / EARLY_FILE, early_end=True)
-        results.append(early)
-    else:
-        (folder / EARLY_FILE).unlink(missing_ok=True)  # of an earlier policy
+    for file in folder.glob("eval*.json"):  # of an earlier policy
+        file.unlink()
+    results = {
+        name: evaluate_checkpoint(policy, num_envs, seed=seed, out=folder / evaluation_file(name), **arguments)
+        for name, arguments in conditions(DictConfig(state["config"])).items()
+    }
     render_checkpoint(policy, seed=seed)
     curve = _plot_curve(Path(run_or_checkpoint), folder / _CURVE_FILE)
     (folder / CARD_FILE).write_text(_card(state, results, folder, seed, curve), encoding="utf-8")
     return folder
+
+
+def evaluation_file(condition: str) -> str:
+    """Name of the file that holds the evaluation under one of `protocol.conditions`."""
+    return EVAL_FILE if condition == "training" else f"eval_{condition}.json"
 
 
 def _plot_curve(run: Path, path: Path) -> bool:
@@ -65,9 +75,9 @@ def _plot_curve(run: Path, path: Path) -> bool:
     return path.is_file()
 
 
-def _card(state: dict, results: list[EvalResult], folder: Path, seed: int, curve: bool) -> str:
+def _card(state: dict, evaluations: dict[str, EvalResult], folder: Path, seed: int, curve: bool) -> str:
     """The text of README.md."""
-    config, result = state["config"], results[0]
+    config, result, results = state["config"], evaluations["training"], list(evaluations.values())
     own = ("output_dir=", "run_name=", "resume=")  # where it ran is nobody else's business
     command = " ".join(["hdmi train", *(text for text in config.get("overrides", ()) if not text.startswith(own))])
     figures = [one.figures() for one in results]
@@ -78,7 +88,6 @@ def _card(state: dict, results: list[EvalResult], folder: Path, seed: int, curve
     for name in dict.fromkeys(cause for one in results for cause in one["termination_causes"]):
         if any(one["termination_causes"].get(name) for one in results):
             rows.append(f"| failed by {name} | {' | '.join(_failed(one, name) for one in results)} |")
-    headings = ["training's terminations", "and its early ends"][: len(results)]
     lines = [
         f"# {state['task']}",
         "",
@@ -96,10 +105,10 @@ def _card(state: dict, results: list[EvalResult], folder: Path, seed: int, curve
         f"`policy.pt` holds the weights and the observations' normalization ({_megabytes(folder / POLICY_FILE)} MB); "
         f"`config.yaml` is the whole config of the training, `{EVAL_FILE}` the evaluation from the first frame, under "
         "the training's reset noise and randomization"
-        + f", `{EARLY_FILE}` one in which what ended training episodes early ends them, too" * (len(results) > 1)
+        + "".join(f", `{evaluation_file(name)}` the one under {_HEADINGS[name]}" for name in list(evaluations)[1:])
         + ":",
         "",
-        f"| {result['num_envs']} episodes | {' | '.join(headings)} |",
+        f"| {result['num_envs']} episodes | {' | '.join(_HEADINGS[name] for name in evaluations)} |",
         "|---" * (1 + len(results)) + "|",
         *rows,
     ]

@@ -109,6 +109,33 @@ def has_early_end(cfg: DictConfig) -> bool:
     return any(node is not None for node in (cfg.get("early_end") or {}).values())
 
 
+def task_starts_config(cfg: DictConfig) -> DictConfig:
+    """A training config with the reset noise of its task, whatever the training had.
+
+    Raises:
+        ConfigError: if conf/task has no such task.
+    """
+    cfg = copy.deepcopy(cfg)
+    with open_dict(cfg):
+        cfg.reset = {**(cfg.reset or {}), "state": task_config(cfg.task.name).reset.state}
+    return cfg
+
+
+def conditions(cfg: DictConfig) -> dict[str, dict[str, bool]]:
+    """What a policy of a config is judged by: name -> arguments of `evaluate_checkpoint`.
+
+    `training` is always there, its terminations and starts; `early_end` where episodes ended earlier in the training,
+    `task_starts` where they started elsewhere than the task's.
+    """
+    found: dict[str, dict[str, bool]] = {"training": {}}
+    if has_early_end(cfg):
+        found["early_end"] = {"early_end": True}
+    noise = ((cfg.reset or {}).get("state") or {}).get("noise")
+    if cfg.task.name in task_files() and noise != task_config(cfg.task.name).reset.state.noise:
+        found["task_starts"] = {"task_starts": True}
+    return found
+
+
 def termination_names(cfg: DictConfig) -> list[str]:
     """Nodes of a config that end episodes as failures."""
     return [str(name) for name, node in (cfg.termination or {}).items() if node is not None]
@@ -410,6 +437,7 @@ def evaluate_checkpoint(
     sim: str | None = None,
     without: Sequence[str] = (),
     early_end: bool = False,
+    task_starts: bool = False,
 ) -> EvalResult:
     """Evaluates a checkpoint by `evaluate_policy` and writes eval.json, which its result then names as `path`.
 
@@ -422,6 +450,7 @@ def evaluate_checkpoint(
         sim: engine (`cpu`, `gpu`) instead of the training's.
         without: names of terminations that do not end episodes.
         early_end: let what ended episodes early in the training end them here, too.
+        task_starts: under the reset noise of the task instead of the training's.
 
     Raises:
         CheckpointError: if there is no usable checkpoint, or it is of another task.
@@ -435,6 +464,8 @@ def evaluate_checkpoint(
         cfg.num_threads = num_threads
     if sim is not None:
         choose_engine(cfg, sim)
+    if task_starts:
+        cfg = task_starts_config(cfg)
     values = evaluate_policy(
         actor, cfg, num_envs, terminations=terminations, seed=seed, without=without, early_end=early_end
     )

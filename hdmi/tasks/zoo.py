@@ -10,21 +10,22 @@ from typing import Any
 import imageio.v2 as imageio
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.table import Table
 from yaml import YAMLError, safe_load
 
 from hdmi.assembly import make_task
 from hdmi.config import ConfigError
-from hdmi.evaluation.protocol import EvalResult, evaluate_checkpoint, has_early_end
+from hdmi.evaluation.protocol import EvalResult, conditions, evaluate_checkpoint
 from hdmi.evaluation.video import VIDEO_FILE
 from hdmi.learning.checkpoint import POLICY_FILE, CheckpointError, load_checkpoint
 from hdmi.tasks.gallery import picture_frame
 
 _COLUMNS = (
-    "policy", "frames", "minutes", "success", "survival", "with early ends", "joints rad", "bodies cm", "object",
-    "what fails",
+    "policy", "frames", "minutes", "success", "survival", "with early ends", "task's noise", "joints rad", "bodies cm",
+    "object", "what fails",
 )  # fmt: skip
+_CONDITIONS = ("early_end", "task_starts")  # of the columns after survival
 _SHEET_COLUMNS = 4
 _STRIDE = 2  # control steps per picture of a policy's video
 
@@ -73,15 +74,23 @@ class Entry:
         name: its folder's.
         frames: of its training, control steps.
         minutes: of collection and learning.
-        result: by the paper's protocol, under the terminations of its training.
-        early: the same where what ended training episodes early ends them, too; None if nothing did.
+        results: by the paper's protocol, under each of `protocol.conditions`.
     """
 
     name: str
     frames: int
     minutes: float
-    result: EvalResult
-    early: EvalResult | None = None
+    results: dict[str, EvalResult]
+
+    @property
+    def result(self) -> EvalResult:
+        """Under the terminations and starts of its training."""
+        return self.results["training"]
+
+    def success(self, condition: str) -> float | None:
+        """Share of episodes that succeed under a condition, None if it is not one of this policy's."""
+        found = self.results.get(condition)
+        return None if found is None else found["success_rate"]["mean"]
 
 
 def evaluate_entry(
@@ -95,11 +104,11 @@ def evaluate_entry(
     """
     file = Path(zoo) / name / POLICY_FILE
     state = load_checkpoint(file)
-    result = evaluate_checkpoint(file, num_envs, seed=seed, num_threads=num_threads)
-    early = None
-    if has_early_end(OmegaConf.create(state["config"])):
-        early = evaluate_checkpoint(file, num_envs, seed=seed, num_threads=num_threads, early_end=True)
-    return Entry(name, state["frames"], state["elapsed"] / 60, result, early)
+    results = {
+        condition: evaluate_checkpoint(file, num_envs, seed=seed, num_threads=num_threads, **arguments)
+        for condition, arguments in conditions(DictConfig(state["config"])).items()
+    }
+    return Entry(name, state["frames"], state["elapsed"] / 60, results)
 
 
 def zoo_rows(entries: Sequence[Entry]) -> list[list[str]]:
@@ -121,7 +130,7 @@ def zoo_rows(entries: Sequence[Entry]) -> list[list[str]]:
         rows.append([
             entry.name, f"{entry.frames / 1e6:.1f} M", f"{entry.minutes:.0f}", shown("success_rate", "{:.1f} %", 100),
             shown("survival", "{:.1f} %", 100),
-            "" if entry.early is None else f"{100 * entry.early['success_rate']['mean']:.1f} %",
+            *("" if (share := entry.success(name)) is None else f"{100 * share:.1f} %" for name in _CONDITIONS),
             shown("joint_error", "{:.3f}"), shown("body_error", "{:.1f}", 100), thing, ", ".join(fails),
         ])  # fmt: skip
     return rows
@@ -176,8 +185,7 @@ def render_sheet(zoo: str | Path, names: Sequence[str], path: str | Path) -> Pat
 
 def _still(folder: Path) -> Any:
     """The picture of a policy's video at mid-contact, or its last one. uint8 [height, width, 3]"""
-    cfg = OmegaConf.create(load_checkpoint(folder / POLICY_FILE)["config"])
-    assert isinstance(cfg, DictConfig)
+    cfg = DictConfig(load_checkpoint(folder / POLICY_FILE)["config"])
     wanted = picture_frame(make_task(cfg)) // _STRIDE
     pictures = imageio.mimread(folder / VIDEO_FILE, memtest=False)
     return pictures[min(wanted, len(pictures) - 1)]
