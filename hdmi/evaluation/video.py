@@ -35,7 +35,7 @@ SIZE = (480, 640)  # height, width
 AFTER_FAILURE = 1.0  # s that are still shown
 
 _GHOST = (0.20, 0.45, 0.95, 0.22)
-_GHOST_INSET = 0.005  # m
+_GHOST_INSET = 0.015  # m
 _INTENDED = (1.0, 0.82, 0.10, 1.0)
 _NOT_INTENDED = (0.55, 0.55, 0.58, 0.8)
 _FORCE = (0.90, 0.12, 0.12, 1.0)
