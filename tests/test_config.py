@@ -152,6 +152,7 @@ PAPER = ("+method=paper",)
 LEVERS = sorted(path.stem for path in (CONF / "lever").glob("*.yaml"))
 # nodes that a lever adds, those that it takes out, and those that it changes
 CHANGED_BY_LEVER: dict[str, tuple[set[str], set[str], set[str]]] = {
+    "close_starts": (set(), set(), set()),  # lift_box starts close by itself
     "early_end": ({"early_end.early_root_pose", "early_end.early_body_pose"}, set(), set()),
     "feedforward": ({"reference.target"}, set(), {"action.target"}),
     "noise_curriculum": ({"reset.curriculum"}, set(), set()),
@@ -185,6 +186,13 @@ class TestLevers:
         assert {key for key in before if before[key] != after[key]} == {
             node.partition(".")[0] for node in added | gone | changed
         }
+
+    def test_close_starts_are_the_laptop_s(self):
+        default, close = (load_config("task=walk", *lever) for lever in ((), ("+lever=close_starts",)))
+        assert close.reset == load_config("task=walk", "+preset=laptop").reset
+        assert close.reset.curriculum is None
+        assert close.reset.state.noise.joint_pos < default.reset.state.noise.joint_pos
+        assert {key for key in close if close[key] != default[key]} == {"reset"}
 
     def test_the_paper_s_method_is_without_those_that_are_on(self):
         ours, paper = load_config("task=walk"), load_config("task=walk", *PAPER, f"+lever=[{','.join(ON_BY_DEFAULT)}]")

@@ -105,7 +105,7 @@ def _card(state: dict, evaluations: dict[str, EvalResult], folder: Path, seed: i
         f"`policy.pt` holds the weights and the observations' normalization ({_megabytes(folder / POLICY_FILE)} MB); "
         f"`config.yaml` is the whole config of the training, `{EVAL_FILE}` the evaluation from the first frame, under "
         "the training's reset noise and randomization"
-        + "".join(f", `{evaluation_file(name)}` the one under {_HEADINGS[name]}" for name in list(evaluations)[1:])
+        + "".join(f"; `{evaluation_file(name)}` likewise under {_HEADINGS[name]}" for name in list(evaluations)[1:])
         + ":",
         "",
         f"| {result['num_envs']} episodes | {' | '.join(_HEADINGS[name] for name in evaluations)} |",

@@ -219,7 +219,7 @@ def write_video(
             if renderer is None:
                 # the model of the world, not of the scene: objects are randomized in size
                 renderer = WorldRenderer(moment.model, overlay.task.scene.robot, *size)
-                writer = imageio.get_writer(partial, fps=fps, codec="libx264", quality=8, macro_block_size=16)
+                writer = imageio.get_writer(partial, fps=fps, codec="libx264", quality=6, macro_block_size=16)
             assert writer is not None
             writer.append_data(picture(renderer, moment, overlay, size))
         if writer is not None:
