@@ -121,13 +121,13 @@ def task_starts_config(cfg: DictConfig) -> DictConfig:
     return cfg
 
 
-def conditions(cfg: DictConfig) -> dict[str, dict[str, bool]]:
+def conditions(cfg: DictConfig) -> dict[str, dict[str, Any]]:
     """What a policy of a config is judged by: name -> arguments of `evaluate_checkpoint`.
 
     `training` is always there, its terminations and starts; `early_end` where episodes ended earlier in the training,
     `task_starts` where they started elsewhere than the task's.
     """
-    found: dict[str, dict[str, bool]] = {"training": {}}
+    found: dict[str, dict[str, Any]] = {"training": {}}
     if has_early_end(cfg):
         found["early_end"] = {"early_end": True}
     noise = ((cfg.reset or {}).get("state") or {}).get("noise")
