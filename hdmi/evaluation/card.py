@@ -69,7 +69,7 @@ def _plot_curve(run: Path, path: Path) -> bool:
     rows = read_rows(metrics)[1] if metrics.is_file() else []
     there = any(row.get(key) for row in rows for key in _CURVES)
     if there:
-        plot_runs([metrics], path, curves=_CURVES)
+        plot_runs([run], path, curves=_CURVES)
     elif run.resolve() != path.parent.resolve():
         path.unlink(missing_ok=True)
     return path.is_file()
