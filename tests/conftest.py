@@ -15,9 +15,10 @@ import torch
 from filelock import FileLock
 from hydra.core.hydra_config import HydraConfig
 from hypothesis import settings
-from mocks import load_config
+from mocks import lift_box, load_config
 
 from hdmi.assets import RobotConfig, Scene, SimConfig, build_scene, default_joint_pos, g1, g1_robot
+from hdmi.envs.rendering import RenderingError, WorldRenderer
 from hdmi.motion import forward_kinematics
 
 settings.register_profile("hdmi", derandomize=True, deadline=None, max_examples=60)
@@ -33,6 +34,16 @@ JOINTS = ("left_knee_joint", "waist_yaw_joint")
 def drawings() -> None:
     """Whatever a test draws from torch's generator is the same in every run."""
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def gl() -> None:
+    """Skips where nothing can be rendered."""
+    scene = lift_box().scene
+    try:
+        WorldRenderer(scene.model, scene.robot, 64, 64).close()
+    except RenderingError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(autouse=True)

@@ -305,15 +305,6 @@ def test_a_checkpoint_of_another_task_is_refused(run: Path):
 # -- videos ---------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def gl() -> None:
-    """Skips where nothing can be rendered."""
-    try:
-        WorldRenderer(lift_box().scene.model, 64, 64).close()
-    except RenderingError as error:
-        pytest.skip(str(error))
-
-
 @pytest.mark.usefixtures("gl")
 @pytest.mark.parametrize("size", [(16, 2560), (1440, 32)])
 def test_pictures_beyond_the_usual_sizes(size: tuple[int, int]):
