@@ -430,6 +430,26 @@ def test_early_ends_and_the_tasks_starts_are_conditions_of_their_own():
         evaluation_config(task_config("lift_box"), early_end=True)
 
 
+def test_each_condition_reaches_its_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    cfg = task_config("walk")
+    cfg.reset.state.noise.joint_pos = 0.03
+    save_checkpoint(tmp_path / "policy.pt", {"config": OmegaConf.to_container(cfg, resolve=True)})
+    loaded = None, cfg, {"file": str(tmp_path / "policy.pt"), "iteration": 1, "frames": 2}
+    monkeypatch.setattr(protocol, "load_checked_policy", lambda path, task: loaded)
+
+    def note(actor, cfg, num_envs, **given):
+        return {"noise": cfg.reset.state.noise.joint_pos, "early_end": given["early_end"], "seed": given["seed"]}
+
+    monkeypatch.setattr(protocol, "evaluate_policy", note)
+    results = protocol.evaluate_conditions(tmp_path, num_envs=4, seed=7, folder=tmp_path)
+    assert {name: (one["noise"], one["early_end"]) for name, one in results.items()} == {
+        "training": (0.03, False), "early_end": (0.03, True), "task_starts": (0.1, False),
+    }  # fmt: skip
+    for name, file in (("training", "eval.json"), ("task_starts", "eval_task_starts.json")):
+        assert EvalResult.load(tmp_path / file)["noise"] == results[name]["noise"]
+    assert {one["seed"] for one in results.values()} == {7}
+
+
 def test_only_a_checkpoint_has_early_ends(capsys: pytest.CaptureFixture[str]):
     assert command("evaluate").main(["agent=zero", "early_end=true"]) == 2
     assert "only a checkpoint" in capsys.readouterr().err

@@ -23,7 +23,7 @@ from hdmi.config import ConfigError, task_config
 from hdmi.envs.rendering import RenderingError
 from hdmi.evaluation.agents import AGENTS, blind_agent
 from hdmi.evaluation.protocol import Policy, load_checked_policy, run_folder_of
-from hdmi.evaluation.video import Moment, Overlay, every, play_moments, replay, show, write_video
+from hdmi.evaluation.video import STRIDE, Moment, Overlay, every, play_moments, replay, show, write_video
 
 
 @dataclass
@@ -39,7 +39,7 @@ class Options:
     seed: int = 0
     out: str | None = None  # play.mp4 in the run folder, or play_<task>_<agent>.mp4 here
     window: bool = False
-    stride: int = 2  # control steps per picture
+    stride: int = STRIDE  # control steps per picture
     width: int = 640
     height: int = 480
 

@@ -150,9 +150,11 @@ def zoo(names: list[str], options: Options, console: Console) -> int:
                 problems.append(f"{name}: {error}")
             console.print(f"{len(entries) + len(problems)}/{len(names)} {name}", highlight=False)
     found = [entries[name] for name in names if name in entries]
-    console.print(zoo_table(found))
     for problem in problems:
         console.print(problem, highlight=False, soft_wrap=True, markup=False)
+    if not found:
+        return 1
+    console.print(zoo_table(found))
     if options.markdown is not None:
         folder = os.path.relpath(options.zoo, Path(options.markdown).parent)
         Path(options.markdown).write_text(zoo_markdown(found, Path(folder).as_posix()), encoding="utf-8")

@@ -6,17 +6,17 @@ import os
 import platform
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from hdmi.deploy.format import GRAPH_FILE, NETWORK_FILE, SCENE_FILE, SPEC_FILE
 from hdmi.evaluation.curves import plot_runs
-from hdmi.evaluation.protocol import EVAL_FILE, EvalResult, conditions, evaluate_checkpoint, unit_of
+from hdmi.evaluation.protocol import EVAL_FILE, EvalResult, evaluate_conditions, evaluation_file, unit_of
 from hdmi.evaluation.video import render_checkpoint
 from hdmi.learning import export_policy, load_checkpoint
 from hdmi.learning.checkpoint import POLICY_FILE
 from hdmi.metrics import METRICS_FILE, read_rows
 
-CARD_FILE = "README.md"
+_CARD_FILE = "README.md"
 _HEADINGS = {
     "training": "training's terminations and starts",
     "early_end": "its early ends, too",
@@ -48,19 +48,11 @@ def export(run_or_checkpoint: str | Path, folder: str | Path, num_envs: int = 25
     OmegaConf.save(OmegaConf.create(state["config"]), folder / "config.yaml")
     for file in folder.glob("eval*.json"):  # of an earlier policy
         file.unlink()
-    results = {
-        name: evaluate_checkpoint(policy, num_envs, seed=seed, out=folder / evaluation_file(name), **arguments)
-        for name, arguments in conditions(DictConfig(state["config"])).items()
-    }
+    results = evaluate_conditions(policy, num_envs, seed, folder=folder)
     render_checkpoint(policy, seed=seed)
     curve = _plot_curve(Path(run_or_checkpoint), folder / _CURVE_FILE)
-    (folder / CARD_FILE).write_text(_card(state, results, folder, seed, curve), encoding="utf-8")
+    (folder / _CARD_FILE).write_text(_card(state, results, folder, seed, curve), encoding="utf-8")
     return folder
-
-
-def evaluation_file(condition: str) -> str:
-    """Name of the file that holds the evaluation under one of `protocol.conditions`."""
-    return EVAL_FILE if condition == "training" else f"eval_{condition}.json"
 
 
 def _plot_curve(run: Path, path: Path) -> bool:

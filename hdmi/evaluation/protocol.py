@@ -24,8 +24,8 @@ from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
 from hdmi.assembly import Task, make_env, make_task
 from hdmi.config import ConfigError, choose_engine, task_config, task_files
-from hdmi.learning.checkpoint import POLICY_FILE, CheckpointError
-from hdmi.learning.policy import load_policy
+from hdmi.learning.checkpoint import POLICY_FILE, CheckpointError, find_checkpoint
+from hdmi.learning.policy import load_config, load_policy
 from hdmi.transforms import ReferenceStateInitialization
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -482,6 +482,37 @@ def evaluate_checkpoint(
     if out is not None:
         result.save(out)
     return result
+
+
+def evaluate_conditions(
+    run_or_checkpoint: str | Path,
+    num_envs: int = 256,
+    seed: int = 0,
+    num_threads: int | None = None,
+    folder: str | Path | None = None,
+) -> dict[str, EvalResult]:
+    """Evaluates a checkpoint under each of its `conditions`, by name.
+
+    Args:
+        run_or_checkpoint, num_envs, seed, num_threads: as of `evaluate_checkpoint`.
+        folder: to write the results to, each into its `evaluation_file`; None for none.
+
+    Raises:
+        CheckpointError, ConfigError, MotionError, OSError: as `evaluate_checkpoint`.
+    """
+    checkpoint = find_checkpoint(run_or_checkpoint)
+    results = {}
+    for name, arguments in conditions(load_config(checkpoint)).items():
+        out = None if folder is None else Path(folder) / evaluation_file(name)
+        results[name] = evaluate_checkpoint(
+            checkpoint, num_envs, seed=seed, num_threads=num_threads, out=out, **arguments
+        )
+    return results
+
+
+def evaluation_file(condition: str) -> str:
+    """Name of the file that holds the evaluation under one of the `conditions`."""
+    return EVAL_FILE if condition == "training" else f"eval_{condition}.json"
 
 
 def load_checked_policy(

@@ -31,6 +31,7 @@ from hdmi.evaluation.protocol import (
 from hdmi.motion import reference_qpos
 
 VIDEO_FILE = "video.mp4"  # in a run folder, or beside an exported policy
+STRIDE = 2  # control steps per picture
 SIZE = (480, 640)  # height, width
 AFTER_FAILURE = 1.0  # s that are still shown
 
@@ -306,7 +307,7 @@ def render_checkpoint(
     start: int = 0,
     seed: int = 0,
     size: tuple[int, int] = SIZE,
-    stride: int = 2,
+    stride: int = STRIDE,
 ) -> Path:
     """Renders the policy of a checkpoint over the whole motion, with the reference as a ghost.
 

@@ -140,7 +140,12 @@ class _Solver:
     def _explain(self, needed: np.ndarray, generators: np.ndarray, price: np.ndarray) -> np.ndarray:
         """What contact forces leave of the needed generalised forces. [nv]
 
-        Forces have a price each. Torques beyond the effort limits are held to them, where contacts can do that, and
+        Args:
+            needed: N and N m. [nv]
+            generators: generalised forces of the contact forces, per N. [nv, K]
+            price: of a N of each, against what is missing; 0 for none. [K]
+
+        Torques beyond the effort limits are held to them, where contacts can do that, and
         balance suffers instead.
         """
         if not generators.size:
@@ -171,14 +176,14 @@ class _Solver:
         columns: list[np.ndarray] = []
         prices: list[float] = []
         lin1, lin2, ang1, ang2 = np.zeros((4, 3, model.nv))
-        nearest: dict[int, float] = {}  # effector -> m, to the object
-        for contact in data.contact:
-            effector = self._intended(t, *map(int, contact.geom))
-            if effector is not None:
-                nearest[effector] = min(nearest.get(effector, np.inf), contact.dist)
-        for contact in data.contact:
+        intended = [self._intended(t, *map(int, contact.geom)) for contact in data.contact]
+        nearest: dict[int | None, float] = {}  # effector -> m, to the object
+        for contact, effector in zip(data.contact, intended, strict=True):
+            nearest[effector] = min(nearest.get(effector, np.inf), contact.dist)
+        for contact, effector in zip(data.contact, intended, strict=True):
             first, second = int(contact.geom[0]), int(contact.geom[1])
-            if (self.robot[first] and self.robot[second]) or contact.dist > self._reach(t, first, second):
+            reach = self._reach(first, second) if effector is None else _REACH
+            if (self.robot[first] and self.robot[second]) or contact.dist > reach:
                 continue
             mujoco.mj_jac(model, data, lin1, ang1, contact.pos, model.geom_bodyid[first])
             mujoco.mj_jac(model, data, lin2, ang2, contact.pos, model.geom_bodyid[second])
@@ -188,7 +193,7 @@ class _Solver:
             slip = jacobian @ data.qvel
             slip -= normal * (normal @ slip)
             speed = np.linalg.norm(slip)
-            if (effector := self._intended(t, first, second)) is not None:
+            if effector is not None:
                 turning = _PATCH * (ang2 - ang1).T @ normal
                 bare = [sign * column for column in (*jacobian, turning) for sign in (1, -1)]
                 columns += bare
@@ -216,9 +221,7 @@ class _Solver:
         touches = effector is not None and self.object[other] and self.contact[t, effector]
         return effector if touches else None
 
-    def _reach(self, t: int, first: int, second: int) -> float:
-        """Up to which distance two geoms can push each other, m."""
-        if self._intended(t, first, second) is not None:
-            return _REACH
+    def _reach(self, first: int, second: int) -> float:
+        """Up to which distance two geoms can push each other that are not meant to, m."""
         on_ground = (self.robot[first] or self.robot[second]) and not (self.object[first] or self.object[second])
         return self.ground_gap + TOUCH if on_ground else TOUCH

@@ -10,15 +10,15 @@ from typing import Any
 import imageio.v2 as imageio
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from omegaconf import DictConfig
 from rich.table import Table
 from yaml import YAMLError, safe_load
 
 from hdmi.assembly import make_task
 from hdmi.config import ConfigError
-from hdmi.evaluation.protocol import EvalResult, conditions, evaluate_checkpoint
-from hdmi.evaluation.video import VIDEO_FILE
+from hdmi.evaluation.protocol import EvalResult, evaluate_conditions
+from hdmi.evaluation.video import STRIDE, VIDEO_FILE
 from hdmi.learning.checkpoint import POLICY_FILE, CheckpointError, load_checkpoint
+from hdmi.learning.policy import load_config
 from hdmi.tasks.gallery import picture_frame
 
 _COLUMNS = (
@@ -27,7 +27,6 @@ _COLUMNS = (
 )  # fmt: skip
 _CONDITIONS = ("early_end", "task_starts")  # of the columns after survival
 _SHEET_COLUMNS = 4
-_STRIDE = 2  # control steps per picture of a policy's video
 
 
 def read_recipes(path: str | Path) -> dict[str, list[str]]:
@@ -104,10 +103,7 @@ def evaluate_entry(
     """
     file = Path(zoo) / name / POLICY_FILE
     state = load_checkpoint(file)
-    results = {
-        condition: evaluate_checkpoint(file, num_envs, seed=seed, num_threads=num_threads, **arguments)
-        for condition, arguments in conditions(DictConfig(state["config"])).items()
-    }
+    results = evaluate_conditions(file, num_envs, seed, num_threads)
     return Entry(name, state["frames"], state["elapsed"] / 60, results)
 
 
@@ -185,7 +181,6 @@ def render_sheet(zoo: str | Path, names: Sequence[str], path: str | Path) -> Pat
 
 def _still(folder: Path) -> Any:
     """The picture of a policy's video at mid-contact, or its last one. uint8 [height, width, 3]"""
-    cfg = DictConfig(load_checkpoint(folder / POLICY_FILE)["config"])
-    wanted = picture_frame(make_task(cfg)) // _STRIDE
+    wanted = picture_frame(make_task(load_config(folder))) // STRIDE
     pictures = imageio.mimread(folder / VIDEO_FILE, memtest=False)
     return pictures[min(wanted, len(pictures) - 1)]
