@@ -19,7 +19,7 @@ from hdmi.evaluation.protocol import evaluation_config, make_evaluation_env
 from hdmi.motion import Motion, forward_kinematics, make_playback
 from hdmi.motion.dynamics import inverse_dynamics, reference_torque
 from hdmi.motion.format import motion_from_poses
-from hdmi.motion.playback import Playback
+from hdmi.motion.playback import Playback, reference_qpos
 
 FPS, T = 50.0, 12
 FOOT = g1.BODY_NAMES.index(g1.FEET[0])
@@ -143,3 +143,27 @@ def test_torques_of_a_grip_hold_the_object(monkeypatch: pytest.MonkeyPatch):
     assert lost[True] < 0.3 * lost[False], lost
     effort = torch.tensor(task.scene.robot.effort_limits)
     assert (torques[True].abs() <= 1.01 * effort).all()
+
+
+def test_a_grip_needs_half_of_the_friction():
+    """Of lift_box, held still between two palms: what the arms' torques leave of gravity is the hands' force."""
+    frame, task = 150, make_task(task_config("lift_box"))
+    playback = Playback(task.reference, task.scene, reference_qpos(task.scene, task.reference), 0.02)
+    model, data = task.scene.model, at_frame(playback, frame)
+    torque = inverse_dynamics(playback, grips=True).torque[frame]
+    across = data.body("box").xmat.reshape(3, 3)[:, 1]  # from palm to palm
+    carried = 0.0
+    for effector in task.scene.effectors:
+        side = effector.body.split("_")[0]
+        joints = [i for i, name in enumerate(task.scene.robot.joint_names) if name.startswith(side) and i >= 15]
+        dofs = task.scene.joint_dof[joints]
+        body = data.body(effector.body)
+        lin, ang = np.zeros((2, 3, model.nv))
+        mujoco.mj_jac(model, data, lin, ang, body.xpos + body.xmat.reshape(3, 3) @ effector.point, body.id)
+        jacobian = np.vstack([lin, ang])[:, dofs]  # [6, 7]
+        force = np.linalg.lstsq(jacobian.T, data.qfrc_bias[dofs] - torque[joints], rcond=None)[0][:3]  # on the hand
+        pressed = abs(force @ across)
+        along = np.linalg.norm(force - (force @ across) * across)
+        assert 0.3 * pressed < along < 0.6 * pressed, effector.body  # half of 1.0, and a little bare force
+        carried -= force[2]
+    assert carried == pytest.approx(9.81 * 0.5, rel=0.15)  # N, of 0.5 kg
