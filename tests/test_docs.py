@@ -27,6 +27,7 @@ MODULES = [
     "hdmi.tasks.gallery",
     "hdmi.workshop.human",
     "hdmi.workshop.ik",
+    "hdmi.workshop.recording",
     "hdmi.workshop.skeleton",
     "hdmi.workshop.view.browser",
     "hdmi.workshop.view.curves",

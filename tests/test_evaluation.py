@@ -123,6 +123,21 @@ def test_errors_over_the_whole_motion_go_on_after_the_end_and_stop_at_a_divergen
     assert summary["object_pos_error_horizon"] is None
 
 
+def test_an_excused_termination_ends_nothing_by_itself():
+    judged = FirstEpisodes(4, horizon=2, causes=["a"], excused=["b"])
+    flags = {"a": [False, True, False, False], "b": [True, True, False, False]}
+    judged.add(after([True, True, False, True], flags=flags))  # the last one by what has no name
+    judged.add(after([False] * 4, flags={"a": [False] * 4, "b": [False] * 4}))
+    assert judged.success.tolist() == [True, False, True, False]
+    assert judged.summary()["termination_causes"] == {"diverged": 0.0, "a": 0.25, "other": 0.25}
+
+
+def test_a_termination_that_the_environment_lacks_excuses_nothing():
+    judged = FirstEpisodes(2, horizon=1, causes=["a"], excused=["b"])
+    judged.add(after([True, False], flags={"a": [True, False]}))
+    assert judged.success.tolist() == [False, True]
+
+
 def test_contact_rate_is_made_over_intended_where_contact_is_intended():
     episodes = FirstEpisodes(3, horizon=3)
     episodes.add(after([False] * 3, contact_made=[0.0, 0.0, 0.0], contact_intended=[0.0, 0.0, 0.0]))

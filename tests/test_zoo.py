@@ -19,7 +19,8 @@ from hdmi.evaluation import EvalResult
 from hdmi.evaluation.protocol import evaluation_config
 from hdmi.learning.checkpoint import CheckpointError, save_checkpoint
 from hdmi.learning.policy import load_policy
-from hdmi.tasks.training import LOG_FILE, Outcome, is_better, train_zoo
+from hdmi.tasks.queue import LOG_FILE
+from hdmi.tasks.training import Outcome, is_better, train_zoo
 from hdmi.tasks.zoo import Entry, policies, read_recipes, render_sheet, zoo_markdown, zoo_rows
 
 ZOO = CONF.parent / "zoo"

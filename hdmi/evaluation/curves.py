@@ -25,7 +25,7 @@ CURVES = {
 }
 _SHARES = ("episode_completed", "contact_rate", "eval/success_rate", "eval/survival")
 _TIMES = ("frames", "minutes")
-_COLOURS = ("#2a6fbb", "#d1603d", "#3a8f5c", "#8a5bb0", "#c29a2b", "#4fa3a5", "#b5477d", "#6b6b6b")
+COLOURS = ("#2a6fbb", "#d1603d", "#3a8f5c", "#8a5bb0", "#c29a2b", "#4fa3a5", "#b5477d", "#6b6b6b")
 
 
 def read_metrics(run: Path) -> dict[str, np.ndarray]:
@@ -105,7 +105,7 @@ def plot_runs(runs: Sequence[Path], out: Path, window: int = 1, curves: Mapping[
                 continue
             y = smooth(table[key], window)
             there = np.isfinite(y)
-            style = {"color": _COLOURS[i % len(_COLOURS)], "lw": 1.6, "marker": "o" if there.sum() < 30 else None}
+            style = {"color": COLOURS[i % len(COLOURS)], "lw": 1.6, "marker": "o" if there.sum() < 30 else None}
             for column, x in enumerate((table["frames"] / 1e6, table["minutes"])):
                 axes[row, column].plot(x[there], y[there], markersize=3, label=label, **style)
     for row, key in enumerate(shown):

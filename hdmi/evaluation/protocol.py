@@ -240,10 +240,19 @@ class FirstEpisodes:
         horizon: steps of a full episode.
         causes: termination names, the first has precedence.
         whole_motion: whether errors over the whole motion are wanted; all its steps must then be added.
+        excused: names of terminations that end no episode here, whatever the environment says.
     """
 
-    def __init__(self, num_envs: int, horizon: int, causes: Sequence[str] = (), whole_motion: bool = True):
+    def __init__(
+        self,
+        num_envs: int,
+        horizon: int,
+        causes: Sequence[str] = (),
+        whole_motion: bool = True,
+        excused: Sequence[str] = (),
+    ):
         self.horizon, self.whole_motion = horizon, whole_motion
+        self.excused = tuple(excused)
         self.causes = (_DIVERGED, *causes, _OTHER)
         self.alive = torch.ones(num_envs, dtype=torch.bool)
         self.survived = torch.zeros(num_envs, dtype=torch.int64)  # steps without termination
@@ -259,6 +268,15 @@ class FirstEpisodes:
         """Takes the `next` of a step of all environments, without resets in between. [N]"""
         self.steps += 1
         terminated = after["terminated"].reshape(-1).cpu()
+        flags = after.get("termination", None)
+
+        def fired_by(cause: str) -> Tensor:
+            return _flag(None if flags is None else flags.get(cause, None), terminated)
+
+        if self.excused:  # what they ended is ended by another cause, or not at all
+            excused = torch.stack([fired_by(cause) for cause in self.excused]).any(0)
+            others = [fired_by(cause) for cause in self.causes if cause not in (_DIVERGED, _OTHER)]
+            terminated = terminated & (torch.stack([~excused, *others]).any(0))
         diverged = _flag(after.get("diverged", None), terminated)
         measured = self.alive & ~diverged
         self._sound &= ~diverged
@@ -275,14 +293,13 @@ class FirstEpisodes:
         unexplained = self.alive & (terminated | diverged)
         self.alive &= ~unexplained
         self.survived += self.alive
-        flags = after.get("termination", None)
         for cause in self.causes:
             if cause == _DIVERGED:
                 fired = diverged
             elif cause == _OTHER:
                 fired = unexplained
             else:
-                fired = _flag(None if flags is None else flags.get(cause, None), terminated)
+                fired = fired_by(cause)
             self._ended[cause] |= unexplained & fired
             unexplained = unexplained & ~fired
 
@@ -342,24 +359,22 @@ def on_device(actor: torch.nn.Module, device: torch.device | None) -> Policy:
 
 
 @torch.no_grad()
-def run_episodes(
-    env: TransformedEnv, policy: Policy, horizon: int, causes: Sequence[str] = (), whole_motion: bool = True
-) -> FirstEpisodes:
+def run_episodes(env: TransformedEnv, policy: Policy, counts: Sequence[FirstEpisodes]) -> None:
     """Plays one episode in every environment, without resets in between.
 
     Args:
-        whole_motion: play the motion to its end, for errors over all of it; otherwise until all episodes have ended.
+        counts: what accumulates its figures, all of one horizon. If one of them is of the whole motion, it is played
+            to its end, otherwise until all episodes have ended.
     """
-    episodes = FirstEpisodes(env.batch_size[0], horizon, causes, whole_motion)
     tensordict = env.reset()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        for _ in range(horizon):
+        for _ in range(counts[0].horizon):
             stepped = env.step(policy(tensordict))
-            episodes.add(stepped["next"])
-            if not whole_motion and not episodes.alive.any():
+            for episodes in counts:
+                episodes.add(stepped["next"])
+            if not any(episodes.whole_motion or episodes.alive.any() for episodes in counts):
                 break
             tensordict = env.step_mdp(stepped)
-    return episodes
 
 
 def evaluate_policy(
@@ -392,31 +407,72 @@ def evaluate_policy(
         ConfigError: for a termination that the config does not have, or a config that cannot be built.
     """
     cfg = evaluation_config(cfg, terminations, without=without, early_end=early_end)
+    return _evaluate(actor, cfg, num_envs, {"": ()}, task, seed, whole_motion)[""]
+
+
+def evaluate_excused(
+    actor: torch.nn.Module,
+    cfg: DictConfig,
+    num_envs: int,
+    excused: Mapping[str, Sequence[str]],
+    task: Task | None = None,
+    seed: int = 0,
+) -> dict[str, EvalResult]:
+    """Evaluates an actor as `evaluate_policy`, several times over the same episodes, without terminations each time.
+
+    Worlds go on after a failure, so that one run through the motion says what would have ended under each set of
+    terminations.
+
+    Args:
+        actor, cfg, num_envs, task, seed: as of `evaluate_policy`.
+        excused: name of a result -> terminations that end no episode of it; those that the config lacks count as such.
+
+    Raises:
+        ConfigError: for a config that cannot be built.
+    """
+    return _evaluate(actor, evaluation_config(cfg), num_envs, excused, task, seed, whole_motion=True)
+
+
+def _evaluate(
+    actor: torch.nn.Module,
+    cfg: DictConfig,
+    num_envs: int,
+    excused: Mapping[str, Sequence[str]],
+    task: Task | None,
+    seed: int,
+    whole_motion: bool,
+) -> dict[str, EvalResult]:
+    """Evaluates an actor under an `evaluation_config`, for each set of terminations that do not count."""
     task = make_task(cfg) if task is None else task
     causes = termination_names(cfg)
     horizon = task.reference.num_frames - 1
+    counting = {name: [cause for cause in causes if cause not in out] for name, out in excused.items()}
+    counts = {
+        name: FirstEpisodes(num_envs, horizon, counting[name], whole_motion, excused=out)
+        for name, out in excused.items()
+    }
     was_training = actor.training
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         env = make_evaluation_env(cfg, task, num_envs)
         try:
             actor.eval()
-            episodes = run_episodes(env, on_device(actor, env.device), horizon, causes, whole_motion)
+            run_episodes(env, on_device(actor, env.device), list(counts.values()))
             env.base_env.backend.overflows()  # warns
         finally:
             actor.train(was_training)
             env.close()
-    return EvalResult(
-        episodes.summary()
-        | {
-            "task": task.name,
-            "motion": task.reference.name,
-            "motion_frames": task.reference.num_frames,
-            "num_envs": num_envs,
-            "terminations": causes,
-            "seed": seed,
-        }
-    )
+    about = {
+        "task": task.name,
+        "motion": task.reference.name,
+        "motion_frames": task.reference.num_frames,
+        "num_envs": num_envs,
+        "seed": seed,
+    }
+    return {
+        name: EvalResult(episodes.summary() | about | {"terminations": counting[name]})
+        for name, episodes in counts.items()
+    }
 
 
 def training_figures(actor: torch.nn.Module, cfg: DictConfig, task: Task) -> dict[str, float]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -11,9 +9,9 @@ from pathlib import Path
 
 from hdmi.evaluation.protocol import EVAL_FILE, EvalResult
 from hdmi.learning.checkpoint import checkpoints, load_checkpoint
+from hdmi.tasks.queue import run_hdmi, train_run
 from hdmi.threads import share_of_processors
 
-LOG_FILE = "train.log"
 # Of every training of a zoo: policies are rendered when they are exported.
 _COMMON = ("video=false", "logger=csv")
 
@@ -115,37 +113,19 @@ def _train(
 ) -> Outcome:
     run, folder = runs / name, zoo / name
     count = f"num_threads={threads}"
-    if not _has_ended(run, recipe):
-        there = bool(checkpoints(run / "checkpoints"))
-        place = [f"resume={run}"] if there else [f"output_dir={runs}", f"run_name={name}"]
-        say(f"{name}: {'continues' if there else 'begins'}, {run / LOG_FILE}")
-        if problem := _hdmi(run, "train", *_COMMON, count, *recipe, *place):
-            return Outcome(name, problem)
+    if not _has_ended(run, recipe) and (problem := train_run(run, [*_COMMON, count, *recipe], say)):
+        return Outcome(name, problem)
     if _episodes(run) != num_envs and (
-        problem := _hdmi(run, "evaluate", f"checkpoint={run}", f"num_envs={num_envs}", count)
+        problem := run_hdmi(run, "evaluate", f"checkpoint={run}", f"num_envs={num_envs}", count)
     ):
         return Outcome(name, problem)
     result = EvalResult.load(run / EVAL_FILE)
     before = EvalResult.load(folder / EVAL_FILE) if (folder / EVAL_FILE).is_file() else None
     if not is_better(result, before):
         return Outcome(name, "", result, before)
-    if problem := _hdmi(run, "export", f"checkpoint={run}", f"out={folder}", f"num_envs={num_envs}", "graph=false"):
+    if problem := run_hdmi(run, "export", f"checkpoint={run}", f"out={folder}", f"num_envs={num_envs}", "graph=false"):
         return Outcome(name, problem, result, before)
     return Outcome(name, "", result, before, kept=True)
-
-
-def _hdmi(run: Path, *arguments: str) -> str:
-    """Runs a command, its output going into the run's log; returns what went wrong, empty if nothing did."""
-    run.mkdir(parents=True, exist_ok=True)
-    log = run / LOG_FILE
-    with log.open("a", encoding="utf-8") as output:
-        done = subprocess.run(
-            [sys.executable, "-m", "hdmi", *arguments], stdout=output, stderr=subprocess.STDOUT, check=False
-        )
-    if done.returncode == 0:
-        return ""
-    said = [line for line in log.read_text(encoding="utf-8").splitlines() if line.strip()] or ["no output"]
-    return f"hdmi {arguments[0]} ended with status {done.returncode}, {log}: {said[-1]}"
 
 
 def _has_ended(run: Path, recipe: Sequence[str]) -> bool:

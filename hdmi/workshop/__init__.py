@@ -1,1 +1,1 @@
-"""Where reference motions are made: readers, retargeting, authoring, annotation, validation, viewers."""
+"""Where reference motions are made: readers, retargeting, authoring, annotation, validation, recording, viewers."""

@@ -6,7 +6,14 @@ annotated = annotate_motion(motion, object=box, effectors=hands, overrides=load_
 """
 
 from hdmi.assets.surface import Surface, object_surfaces
-from hdmi.workshop.annotate.contacts import ContactCriteria, contact_points, find_contacts, intervals, label_contacts
+from hdmi.workshop.annotate.contacts import (
+    ContactCriteria,
+    contact_points,
+    find_contacts,
+    intervals,
+    label_contacts,
+    without_chatter,
+)
 from hdmi.workshop.annotate.labelling import Agreement, agreement, annotate_motion, complete_object
 from hdmi.workshop.annotate.overrides import FILE, Interval, Overrides, load_overrides
 from hdmi.workshop.annotate.trajectory import complete_hinge, complete_trajectory
@@ -29,4 +36,5 @@ __all__ = [
     "label_contacts",
     "load_overrides",
     "object_surfaces",
+    "without_chatter",
 ]

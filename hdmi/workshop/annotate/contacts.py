@@ -165,15 +165,23 @@ def _label(
     carried = moving & (relative < criteria.along * speed) & (gap < criteria.reach)
     near = _hysteresis((gap < criteria.touch) | carried, (gap < criteria.release) | carried)
     label = near & (relative < np.maximum(criteria.still, criteria.slip * speed))
-    pause, lead = round(criteria.pause * fps), round(criteria.lead * fps)
-    label = binary_closing(np.pad(label, pause), np.ones(pause + 1, bool))[pause : len(label) + pause]
+    lead = round(criteria.lead * fps)
     out = np.zeros_like(label)
-    for first, last in intervals(label):
+    for first, last in intervals(without_chatter(label, round(criteria.pause * fps))):
         moved = first + np.flatnonzero(moving[first : last + 1])
-        if last - first >= pause and fixed:
+        if fixed:
             out[first : last + 1] = True
-        elif last - first >= pause and moved.size:
+        elif moved.size:
             out[max(first, moved[0] - lead) : min(last, moved[-1] + lead) + 1] = True
+    return out
+
+
+def without_chatter(label: np.ndarray, pause: int) -> np.ndarray:
+    """Labels with interruptions of up to `pause` frames bridged, then without contacts of up to so many. bool [T]"""
+    bridged = binary_closing(np.pad(label, pause), np.ones(pause + 1, bool))[pause : len(label) + pause]
+    out = np.zeros_like(bridged)
+    for first, last in intervals(bridged):
+        out[first : last + 1] = last - first >= pause
     return out
 
 
