@@ -21,7 +21,7 @@ from hdmi.config import ConfigError, task_config
 from hdmi.envs.rendering import RenderingError, WorldRenderer
 from hdmi.evaluation import EvalResult, evaluate_checkpoint, evaluate_policy, protocol, render_checkpoint, video
 from hdmi.evaluation.agents import BlindAgent, blind_agent
-from hdmi.evaluation.curves import read_metrics
+from hdmi.evaluation.curves import groups_of, over_seeds, read_metrics
 from hdmi.evaluation.protocol import FirstEpisodes, conditions, evaluation_config, task_starts_config, termination_names
 from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from hdmi.learning.policy import load_policy, make_networks
@@ -582,3 +582,25 @@ def test_runs_without_rows_are_left_out_of_the_picture(tmp_path: Path, capsys: p
     assert not out.exists()
     table = read_metrics(tmp_path / "cut_off")
     assert table["frames"].tolist() == [100]
+
+
+def test_runs_that_differ_in_the_seed_are_one_curve(tmp_path: Path):
+    header = "iteration,frames,minutes,joint_error,eval/success_rate\n"
+    for seed, error in ((0, 0.2), (1, 0.4)):
+        run = tmp_path / f"seed{seed}"
+        run.mkdir()
+        rows = [f"{i},{100 * (i + 1)},{i + seed},{error},\n" for i in range(2 + seed)]
+        (run / "metrics.csv").write_text(header + "".join(rows))
+        overrides = ["task=walk", f"seed={seed}", f"run_name=seed{seed}", "video=false"]
+        OmegaConf.save(OmegaConf.create({"overrides": overrides}), run / "config.yaml")
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "metrics.csv").write_text(header + "0,100,1,0.5,\n")
+    runs = sorted(path for path in tmp_path.iterdir())
+    assert groups_of(runs) == {"other": [other], "task=walk": runs[1:]}
+    mean, band = over_seeds([read_metrics(run) for run in runs[1:]], "joint_error")
+    assert mean.tolist() == pytest.approx([0.3, 0.3])
+    assert band.tolist() == [[0.2, 0.2], [0.4, 0.4]]
+    out = tmp_path / "curves.png"
+    assert command("plot").main([*map(str, runs), "--seeds", "--out", str(out)]) == 0
+    assert imageio.imread(out).shape[1] == 1300

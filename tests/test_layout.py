@@ -24,6 +24,7 @@ LAYERS = (
     ("evaluation",),
     ("workshop",),
     ("tasks",),
+    ("studies",),
     ("commands",),
     ("__main__",),
 )

@@ -246,7 +246,7 @@ def trainings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., 
 def start(study: Study, folder: Path) -> tuple[dict[str, str], list[str]]:
     """Runs a study; what went wrong, and what was said."""
     said: list[str] = []
-    return run_study(study, folder / "runs", folder / "motions", jobs=1, say=said.append), said
+    return run_study(study, folder / "runs", folder / "out", jobs=1, say=said.append), said
 
 
 def test_a_study_trains_and_evaluates_what_is_missing_and_repeats_nothing(
@@ -329,7 +329,7 @@ def test_a_recorded_variant_is_trained_on_what_the_best_run_of_its_source_did(
     problems, _ = start(study, tmp_path)
     assert problems == {}
     assert recorded == [(tmp_path / "runs" / "walk" / "full_seed1", "walk")]
-    root = tmp_path / "motions" / "walk_full"
+    root = tmp_path / "out" / "motions" / "walk_full"
     assert (root / "walk" / "motion.npz").is_file()
     assert [f"motion_root={root}" in options for _, options in there.calls] == [True, True]
     start(study, tmp_path)
@@ -506,7 +506,7 @@ def test_a_report_of_what_is_there_says_how_much_is_missing(tmp_path: Path, monk
     def refuse(*_: Any, **__: Any) -> None:
         raise RenderingError("no OpenGL")
 
-    monkeypatch.setattr("hdmi.studies.report.poses_at", refuse)
+    monkeypatch.setattr("hdmi.studies.document.poses_at", refuse)
     study = small(without=("none",), figures=(Figure("bars"), Figure("poses")))
     leave_run(tmp_path / "runs", study.jobs[0], [0.0])
     said: list[str] = []
@@ -518,8 +518,25 @@ def test_a_report_of_what_is_there_says_how_much_is_missing(tmp_path: Path, monk
     assert "Figure 2 (poses) could not be drawn: no OpenGL" in text
 
 
+def test_rows_of_an_earlier_report_stay_and_are_not_trained_again(trainings: Callable[..., Trainings], tmp_path: Path):
+    study = finished(tmp_path / "elsewhere", tasks=("walk",))
+    before = write_report(study, tmp_path / "elsewhere", tmp_path / "out").read_text()
+    there = trainings(study)
+    problems, _ = start(study, tmp_path)
+    assert (problems, there.calls) == ({}, [])
+    assert write_report(study, tmp_path / "runs", tmp_path / "out").read_text() == before
+    longer = replace(study, total_frames=16384)
+    assert read_rows_of(longer, tmp_path / "runs", tmp_path / "out") == []
+    with (tmp_path / "out" / "curves.csv").open("a") as file:
+        file.write("full,walk,0,12")  # written in part
+    assert len(read_rows_of(study, tmp_path / "runs", tmp_path / "out")) == 4
+    (tmp_path / "out" / "curves.csv").write_text("variant,task,seed\nfull,walk,0\n")
+    with pytest.raises(ConfigError, match=r"out: runs\.csv or curves\.csv is damaged \(KeyError\('frames'\)\)"):
+        read_rows_of(study, tmp_path / "runs", tmp_path / "out")
+
+
 def test_pairs_are_of_the_seeds_that_both_have(tmp_path: Path):
-    study = small(tasks=("walk",), seeds=3)
+    study = small(tasks=("walk",), seeds=3, without=("lost_contact",))
     for job, success in zip(study.jobs, (0.1, 0.2, 0.3, None, 0.5, 0.6), strict=True):
         if success is not None:
             leave_run(tmp_path, job, [success])

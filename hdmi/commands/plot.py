@@ -1,6 +1,6 @@
 """Plots learning curves of runs against frames and minutes.
 
-hdmi plot RUN [RUN ...] --out curves.png
+hdmi plot RUN [RUN ...] [--seeds] --out curves.png
 """
 
 from __future__ import annotations
@@ -18,9 +18,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folder, or a metrics.csv")
     parser.add_argument("--out", type=Path, default=Path("curves.png"), help="picture to write (default: %(default)s)")
     parser.add_argument("--smooth", type=int, default=1, metavar="ROWS", help="trailing mean over so many rows")
+    parser.add_argument(
+        "--seeds", action="store_true", help="runs that differ only in their seed are one curve, with a band around it"
+    )
     options = parser.parse_args(arguments)
     try:
-        plot_runs(options.runs, options.out, max(options.smooth, 1))
+        plot_runs(options.runs, options.out, max(options.smooth, 1), seeds=options.seeds)
     except (OSError, ValueError) as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 2

@@ -8,7 +8,9 @@ A study is a file in conf/study: variants of a training (ablations, levers), tas
 count in its evaluations, and figures. Trainings run `jobs` at a time in `runs`/<task>/<variant>_seed<n>, which studies
 share; one that is there is not trained again, one that was interrupted continues, so that the same command goes on
 until all is there. The report goes into `out`: report.md, runs.csv with a line for each run, curves.csv with one for
-each evaluation on the way, figures as PNG and PDF. `report` writes it from what is there, without training.
+each evaluation on the way, figures as PNG and PDF. `report` writes it from what is there, without training. Lines of an
+earlier report in `out` whose run folders are elsewhere stay, and are not trained again: a study can be spread over
+machines.
 
 On a cluster: `hdmi study list study=NAME` prints the command of each training, for `hdmi train` under any launcher;
 `report` reads the folders.
@@ -87,7 +89,7 @@ def command(arguments: list[str], console: Console) -> int:
         for line in commands_of(study, runs):
             say(line)
         return 0
-    problems = {} if words else run_study(study, runs, folder / "motions", options.jobs, say)
+    problems = {} if words else run_study(study, runs, folder, options.jobs, say)
     say(str(write_report(study, runs, folder, say)))
     return int(bool(problems))
 

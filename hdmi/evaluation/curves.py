@@ -10,7 +10,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
+from omegaconf import OmegaConf
 
+from hdmi.learning.resume import CONFIG_FILE, of_training
 from hdmi.metrics import METRICS_FILE, read_rows
 
 # column -> label; shown are those that any run has
@@ -57,6 +59,27 @@ def labels_of(runs: Sequence[Path]) -> list[str]:
     ]
 
 
+def groups_of(runs: Sequence[Path]) -> dict[str, list[Path]]:
+    """Runs that differ in nothing but their seed and where they ran, by the arguments that they were started with.
+
+    A run whose config says nothing of its arguments stays by itself, under its name.
+    """
+    found: dict[str, list[Path]] = {}
+    for run, label in zip(runs, labels_of(runs), strict=True):
+        file = (run.parent if run.is_file() else run) / CONFIG_FILE
+        overrides = OmegaConf.select(OmegaConf.load(file), "overrides") if file.is_file() else None
+        own = label if overrides is None else " ".join(t for t in of_training(overrides) if not t.startswith("seed="))
+        found.setdefault(own or "default", []).append(run)
+    return found
+
+
+def over_seeds(tables: Sequence[Mapping[str, np.ndarray]], key: str) -> tuple[np.ndarray, np.ndarray]:
+    """A figure of several runs in the rows that all of them have: mean, and lowest and highest value. [T], [2, T]"""
+    length = min(len(table["frames"]) for table in tables)
+    values = np.stack([table.get(key, np.full(length, np.nan))[:length] for table in tables])
+    return values.mean(0), np.stack([values.min(0), values.max(0)])
+
+
 def smooth(values: np.ndarray, window: int) -> np.ndarray:
     """Trailing mean over up to `window` rows, ignoring NaN."""
     out = np.full_like(values, np.nan)
@@ -67,7 +90,9 @@ def smooth(values: np.ndarray, window: int) -> np.ndarray:
     return out
 
 
-def plot_runs(runs: Sequence[Path], out: Path, window: int = 1, curves: Mapping[str, str] = CURVES) -> None:
+def plot_runs(
+    runs: Sequence[Path], out: Path, window: int = 1, curves: Mapping[str, str] = CURVES, seeds: bool = False
+) -> None:
     """Draws the curves of all runs into a picture: one row per figure, against frames and against minutes.
 
     A run without usable metrics.csv is told on the standard error output and left out.
@@ -77,6 +102,7 @@ def plot_runs(runs: Sequence[Path], out: Path, window: int = 1, curves: Mapping[
         out: picture to write.
         window: rows of a trailing mean.
         curves: column -> label; shown are those that any run has.
+        seeds: draw runs that differ only in their seed as one curve, their mean, with a band from lowest to highest.
 
     Raises:
         ValueError: if no run is left.
@@ -93,21 +119,30 @@ def plot_runs(runs: Sequence[Path], out: Path, window: int = 1, curves: Mapping[
     for problem in problems:
         print(f"left out: {problem}", file=sys.stderr)
     runs, tables = list(found), list(found.values())
+    groups = groups_of(runs) if seeds else {label: [run] for label, run in zip(labels_of(runs), runs, strict=True)}
     shown = [key for key in curves if any(np.isfinite(table.get(key, np.nan)).any() for table in tables)]
     if not shown:
         raise ValueError(f"none of the runs has any of {', '.join(curves)}")
     figure = Figure(figsize=(10, 2.1 * len(shown) + 0.6))
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(shown), 2, sharex="col", sharey="row", squeeze=False)
-    for table, label, i in zip(tables, labels_of(runs), range(len(tables)), strict=True):
+    for i, (label, members) in enumerate(groups.items()):
+        table_of = [found[run] for run in members]
+        times = [over_seeds(table_of, key)[0] for key in _TIMES]
         for row, key in enumerate(shown):
-            if key not in table:
-                continue
-            y = smooth(table[key], window)
+            mean, band = over_seeds(table_of, key)
+            y = smooth(mean, window)
             there = np.isfinite(y)
-            style = {"color": COLOURS[i % len(COLOURS)], "lw": 1.6, "marker": "o" if there.sum() < 30 else None}
-            for column, x in enumerate((table["frames"] / 1e6, table["minutes"])):
-                axes[row, column].plot(x[there], y[there], markersize=3, label=label, **style)
+            if not there.any():
+                continue
+            colour = COLOURS[i % len(COLOURS)]
+            style = {"color": colour, "lw": 1.6, "marker": "o" if there.sum() < 30 else None}
+            name = label if len(members) == 1 else f"{label} ({len(members)} seeds)"
+            for column, x in enumerate((times[0] / 1e6, times[1])):
+                axes[row, column].plot(x[there], y[there], markersize=3, label=name, **style)
+                if len(members) > 1:
+                    low, high = (smooth(edge, window)[there] for edge in band)
+                    axes[row, column].fill_between(x[there], low, high, color=colour, alpha=0.18, lw=0)
     for row, key in enumerate(shown):
         axes[row, 0].set_ylabel(curves[key])
         if key in _SHARES:

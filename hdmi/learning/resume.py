@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,23 @@ KEPT = {
 _PROBLEM = ("stack", "starts", "task", "robot", "sim", "reference_set", "num_envs")
 _NETWORKS = ("trainer", "actor_hidden", "critic_hidden", "activation")
 
+# Arguments of a training that say where it runs and what it leaves, not what it learns.
+_PLACE = (
+    "output_dir=", "run_name=", "resume=", "num_threads=", "keep_checkpoints=", "checkpoint_interval=", "video=",
+    "logger=", "eval_interval=", "eval_envs=",
+)  # fmt: skip
+
 _Path = tuple[str, ...]
+
+
+def of_training(arguments: Iterable[str]) -> list[str]:
+    """The arguments of a training that decide what it learns.
+
+    Examples:
+        >>> of_training(["task=walk", "video=false", "output_dir=runs/walks", "seed=1"])
+        ['task=walk', 'seed=1']
+    """
+    return [text for text in arguments if not text.startswith(_PLACE)]
 
 
 class _Absent:

@@ -159,7 +159,7 @@ def draw_starts(study: Study, figure: Figure, found: Mapping[tuple[str, str], St
             above.plot(time, middle, color=colour, lw=1.6, label=variant.label)
             above.fill_between(time, low, high, color=colour, alpha=0.18, lw=0)
             below.plot(time, starts.alive.mean(1), color=colour, lw=1.6)
-            if name == next(reversed(study.variants)):
+            if name == list(study.variants)[-1]:
                 above.plot(time, starts.reference, "k--", lw=1, label="reference")
         above.set_title(f"{task}, from its lowest frame", fontsize=9, loc="left")
         below.set_xlabel("time (s)")

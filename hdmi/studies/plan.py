@@ -38,6 +38,10 @@ class Variant:
         arguments: of `hdmi train`, beside the study's.
         reference: name of the variant whose policy is played and recorded, to train on that motion; none for the
             task's own motion.
+
+    Examples:
+        >>> Variant("no_rsi", arguments=("+ablation=no_rsi",)).label
+        'no rsi'
     """
 
     name: str
@@ -62,6 +66,14 @@ class Figure:
         without: terminations that do not count, as the study's; each is a row of its own.
         tasks: of the study's, all if empty.
         title: above it.
+
+    Raises:
+        ValueError: for another kind, or what is no list of texts.
+
+    Examples:
+        >>> Figure("pie")
+        Traceback (most recent call last):
+        ValueError: kind: expected one of bars, summary, curves, poses, starts, got 'pie'
     """
 
     kind: str
@@ -94,6 +106,14 @@ class Study:
             tables show.
         arguments: of every training.
         figures: of the report.
+
+    Raises:
+        ValueError: for a count below 1, or without variants or tasks; names the field.
+
+    Examples:
+        >>> study = read_study("residual_action", tasks=["lift_box"], seeds=2)
+        >>> len(study.jobs), study.jobs[0].name
+        (8, 'lift_box/residual_seed0')
     """
 
     name: str
@@ -134,7 +154,13 @@ class Study:
 
 @dataclass(frozen=True)
 class Job:
-    """One training of a study."""
+    """One training of a study.
+
+    Examples:
+        >>> job = read_study("interaction_reward", seeds=1, total_frames=1000).jobs[1]
+        >>> job.arguments[1:]
+        ['+preset=laptop', '+ablation=no_interaction_reward', 'seed=0', 'total_frames=1000']
+    """
 
     study: Study
     variant: Variant

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +12,17 @@ from typing import Any
 
 import numpy as np
 
+from hdmi.config import ConfigError
 from hdmi.learning.checkpoint import load_checkpoint
-from hdmi.studies.measure import Points, read_points
+from hdmi.studies.measure import NONE, read_points
 from hdmi.studies.plan import Job, Study
 from hdmi.studies.statistics import Sample
 
 RUNS_FILE = "runs.csv"
 CURVES_FILE = "curves.csv"
+_TRAIN = "hdmi train "
+
+Figures = dict[str, float]  # column of a csv -> mean over the episodes of an evaluation
 
 
 @dataclass(frozen=True)
@@ -26,19 +31,20 @@ class Row:
 
     Args:
         job: what it was to be.
-        folder: of the run.
-        points: its evaluations, by frames.
-        frames: that it was trained.
+        folder: of the run; None where only its line in runs.csv is here.
+        points: its evaluations, by the frames that it had been trained.
         minutes: of collection and learning.
-        arguments: of `hdmi train`, but for where it ran.
     """
 
     job: Job
-    folder: Path
-    points: Points
-    frames: int
+    folder: Path | None
+    points: Mapping[int, Figures]
     minutes: float
-    arguments: tuple[str, ...]
+
+    @property
+    def frames(self) -> int:
+        """That it was trained."""
+        return max(self.points)
 
     def figure(self, of: str, without: str, frames: int | None = None) -> float:
         """The mean of a figure over the episodes of an evaluation, NaN where there is none.
@@ -48,30 +54,87 @@ class Row:
             without: termination that does not count.
             frames: of the training; None for the last evaluation.
         """
-        results = self.points.get(max(self.points) if frames is None else frames, {})
-        entry = results.get(without, {}).get(of)
-        return np.nan if entry is None else float(entry["mean"])
+        return self.points.get(self.frames if frames is None else frames, {}).get(column_of(of, without), np.nan)
 
 
-def read_rows_of(study: Study, runs: Path) -> list[Row]:
-    """The runs of a study that have been trained to their end and evaluated; others are not there.
+def column_of(figure: str, without: str) -> str:
+    """The column of a figure in a csv.
+
+    Examples:
+        >>> column_of("success_rate", "none"), column_of("success_rate", "lost_contact")
+        ('success_rate', 'success_rate/without_lost_contact')
+    """
+    return figure if without == NONE else f"{figure}/without_{without}"
+
+
+def read_rows_of(study: Study, runs: Path, folder: Path | None = None) -> list[Row]:
+    """The runs of a study that have been trained to their end and evaluated.
+
+    Args:
+        runs: folder of the run folders.
+        folder: of an earlier report: lines of its csv files count where the run folder is not here, if they are of the
+            same arguments.
 
     Raises:
-        CheckpointError, ConfigError: for a run folder that cannot be read.
+        CheckpointError, ConfigError: for a run folder or a csv that cannot be read.
     """
+    kept = {} if folder is None else _read_csv(study, folder)
     rows = []
     for job in study.jobs:
-        folder = runs / job.name
-        points = read_points(folder)
-        if not points:
-            continue
-        state = load_checkpoint(folder)
-        if state["frames"] not in points or state["frames"] < state["config"]["total_frames"]:
-            continue
-        own = ("output_dir=", "run_name=", "resume=", "num_threads=", "keep_checkpoints=", "checkpoint_interval=")
-        arguments = tuple(text for text in state["config"].get("overrides", ()) if not text.startswith(own))
-        rows.append(Row(job, folder, points, state["frames"], state["elapsed"] / 60, arguments))
+        row = _row_of(study, job, runs / job.name) or kept.get(job.name)
+        if row is not None:
+            rows.append(row)
     return rows
+
+
+def _row_of(study: Study, job: Job, folder: Path) -> Row | None:
+    points = read_points(folder)
+    if not points:
+        return None
+    state = load_checkpoint(folder)
+    if state["frames"] not in points or state["frames"] < state["config"]["total_frames"]:
+        return None
+    figures = {
+        frames: {
+            column_of(key, without): float(value["mean"])
+            for without in study.without
+            for key, value in results.get(without, {}).items()
+            if isinstance(value, dict) and "mean" in value
+        }
+        for frames, results in points.items()
+    }
+    return Row(job, folder, figures, state["elapsed"] / 60)
+
+
+def _read_csv(study: Study, folder: Path) -> dict[str, Row]:
+    """The rows of a report that are of this study's trainings, by the name of the job."""
+    lines = _lines(folder / RUNS_FILE)
+    curves: dict[tuple[str, ...], dict[int, Figures]] = {}
+    about = ("variant", "task", "seed")
+    try:
+        for line in _lines(folder / CURVES_FILE):
+            figures = {key: float(text) for key, text in line.items() if key not in (*about, "frames") and text}
+            curves.setdefault(tuple(line[key] for key in about), {})[int(line["frames"])] = figures
+        there = {tuple(line[key] for key in about): line for line in lines}
+        rows = {}
+        for job in study.jobs:
+            key = (job.variant.name, job.task, str(job.seed))
+            if key not in there or key not in curves:
+                continue
+            if shlex.split(there[key]["command"].removeprefix(_TRAIN)) == job.arguments:
+                rows[job.name] = Row(job, None, curves[key], float(there[key]["minutes"]))
+        return rows
+    except (KeyError, ValueError) as error:
+        raise ConfigError(f"{folder}: {RUNS_FILE} or {CURVES_FILE} is damaged ({error!r}); remove both") from error
+
+
+def _lines(path: Path) -> list[dict[str, str]]:
+    """The lines of a csv, none if there is none; a line that was written in part is left out."""
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8", errors="replace") as file:
+        lines = list(csv.DictReader(file))
+    return [line for line in lines if None not in line and None not in line.values()]
 
 
 def samples(rows: Iterable[Row], variant: str, tasks: Sequence[str], of: str, without: str) -> list[Sample]:
@@ -102,10 +165,8 @@ def paired(
     return first, second
 
 
-def write_rows(study: Study, rows: Sequence[Row], folder: Path) -> None:
+def write_rows(rows: Sequence[Row], folder: Path) -> None:
     """Writes runs.csv, a line for each run, and curves.csv, a line for each of its evaluations.
-
-    Figures are `<figure>` with all terminations, `<figure>/without_<termination>` otherwise.
 
     Raises:
         OSError: if they cannot be written.
@@ -113,24 +174,20 @@ def write_rows(study: Study, rows: Sequence[Row], folder: Path) -> None:
     runs, curves = [], []
     for row in rows:
         about = {"variant": row.job.variant.name, "task": row.job.task, "seed": row.job.seed}
-        command = "hdmi train " + " ".join(row.arguments)
-        runs.append({**about, "minutes": f"{row.minutes:.2f}", **_figures(study, row, row.frames), "command": command})
-        curves += [{**about, **_figures(study, row, frames)} for frames in sorted(row.points)]
+        last = {"frames": row.frames, "minutes": f"{row.minutes:.2f}", **_texts(row.points[row.frames])}
+        runs.append({**about, **last, "command": command_of(row)})
+        curves += [{**about, "frames": frames, **_texts(row.points[frames])} for frames in sorted(row.points)]
     for name, lines in ((RUNS_FILE, runs), (CURVES_FILE, curves)):
         _write_csv(folder / name, lines)
 
 
-def _figures(study: Study, row: Row, frames: int) -> dict[str, Any]:
-    found: dict[str, Any] = {"frames": frames}
-    for without in study.without:
-        result = row.points[frames].get(without, {})
-        suffix = "" if without == "none" else f"/without_{without}"
-        found |= {f"{key}{suffix}": f"{value['mean']:.6g}" for key, value in result.items() if _is_figure(value)}
-    return found
+def command_of(row: Row) -> str:
+    """What trains a run, but for where."""
+    return _TRAIN + shlex.join(row.job.arguments)
 
 
-def _is_figure(value: Any) -> bool:
-    return isinstance(value, dict) and "mean" in value
+def _texts(figures: Figures) -> dict[str, str]:
+    return {key: f"{value:.6g}" for key, value in figures.items()}
 
 
 def _write_csv(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
@@ -139,7 +196,7 @@ def _write_csv(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     partial = path.with_suffix(".partial")
     try:
         with partial.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, fields, restval="")
+            writer = csv.DictWriter(file, fields, restval="", lineterminator="\n")
             writer.writeheader()
             writer.writerows(lines)
         os.replace(partial, path)

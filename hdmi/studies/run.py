@@ -12,16 +12,17 @@ from pathlib import Path
 from hdmi.config import ConfigError
 from hdmi.learning.checkpoint import CheckpointError
 from hdmi.learning.policy import load_policy
+from hdmi.learning.resume import of_training
 from hdmi.motion import MotionError, save_motion
 from hdmi.studies.measure import NONE, is_measured, measure_run, read_points, task_terminations_config
 from hdmi.studies.plan import Job, Study
+from hdmi.studies.rows import read_rows_of
 from hdmi.tasks.queue import frames_left, overrides_of, train_run
 from hdmi.threads import share_of_processors
 from hdmi.workshop.recording import record_motion
 
 # Of every training: the study evaluates and renders by itself.
 _COMMON = ("video=false", "logger=csv", "eval_interval=0", "eval_envs=1")
-_OWN = ("num_threads=", "output_dir=", "run_name=", "checkpoint_interval=", "keep_checkpoints=", *_COMMON)
 _PROBLEMS = (CheckpointError, ConfigError, MotionError, OSError, RuntimeError)
 
 Say = Callable[[str], None]
@@ -45,7 +46,8 @@ def check_jobs(jobs: Sequence[Job], runs: Path) -> dict[str, int]:
         run = runs / job.name
         if frames_left(run) is None:
             continue
-        there = {text for text in overrides_of(run) if not text.startswith((*_OWN, "motion_root="))}
+        found = of_training(overrides_of(run))
+        there = {text for text in found if job.variant.reference is None or not text.startswith("motion_root=")}
         wanted = set(job.arguments)
         if there != wanted:
             differ = ", ".join(sorted(there ^ wanted))
@@ -53,15 +55,16 @@ def check_jobs(jobs: Sequence[Job], runs: Path) -> dict[str, int]:
     return intervals
 
 
-def run_study(study: Study, runs: Path, motions: Path, jobs: int = 2, say: Say = print) -> dict[str, str]:
+def run_study(study: Study, runs: Path, folder: Path, jobs: int = 2, say: Say = print) -> dict[str, str]:
     """Trains and evaluates a study, several trainings at a time, each in a process of its own.
 
-    What is there is not trained again; what was interrupted continues. Variants that are trained on a recorded motion
+    What is there is not trained again, nor what the rows of an earlier report have; what was interrupted continues.
+    Variants that are trained on a recorded motion
     come last: the best run of the variant that they name is played and recorded, once for each task.
 
     Args:
         runs: folder of the run folders, which studies may share.
-        motions: folder of recorded motions, `motions/<task>/<motion>`.
+        folder: of the report; recorded motions go into its `motions`.
         jobs: trainings at a time.
         say: takes what there is to tell, a line at a time.
 
@@ -71,7 +74,8 @@ def run_study(study: Study, runs: Path, motions: Path, jobs: int = 2, say: Say =
     Raises:
         ConfigError, CheckpointError: as `check_jobs`, before anything is trained.
     """
-    everything = study.jobs
+    reported = {row.job.name for row in read_rows_of(study, runs, folder) if row.folder is None}
+    everything = [job for job in study.jobs if job.name not in reported]
     intervals = check_jobs(everything, runs)
     roots: dict[tuple[str, str], Path] = {}  # variant that is recorded, task -> motion root
     problems: dict[str, str] = {}
@@ -79,7 +83,7 @@ def run_study(study: Study, runs: Path, motions: Path, jobs: int = 2, say: Say =
         [job for job in everything if job.variant.reference is None],
         [job for job in everything if job.variant.reference is not None],
     ):
-        ready = []
+        ready: list[tuple[Job, Sequence[str]]] = []
         for job in stage:
             if job.variant.reference is None:
                 ready.append((job, []))
@@ -87,7 +91,7 @@ def run_study(study: Study, runs: Path, motions: Path, jobs: int = 2, say: Say =
             key = (job.variant.reference, job.task)
             try:
                 if key not in roots:
-                    roots[key] = _recorded(study, *key, runs, motions, say)
+                    roots[key] = _recorded(study, *key, runs, folder / "motions", say)
                 ready.append((job, [f"motion_root={roots[key]}"]))
             except _PROBLEMS as error:
                 problems[job.name] = f"no recorded motion: {error}"

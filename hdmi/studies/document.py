@@ -25,7 +25,7 @@ from hdmi.studies.figures import (
 )
 from hdmi.studies.plan import Figure, Job, Study, of_tasks
 from hdmi.studies.probes import LAUNCH, Poses, Starts, first_second, poses_at
-from hdmi.studies.rows import Row, paired, read_rows_of, samples, write_rows
+from hdmi.studies.rows import Row, command_of, paired, read_rows_of, samples, write_rows
 from hdmi.studies.statistics import CONFIDENCE, Estimate, improvement, iqm, paired_difference
 
 REPORT_FILE = "report.md"
@@ -51,8 +51,8 @@ def write_report(study: Study, runs: Path, folder: Path, say: Say = print) -> Pa
         CheckpointError, ConfigError: for a run folder that cannot be read.
         OSError: if something cannot be written.
     """
-    rows = read_rows_of(study, runs)
-    write_rows(study, rows, folder)
+    rows = read_rows_of(study, runs, folder)
+    write_rows(rows, folder)
     parts = [_head(study, rows), _verdicts(study, rows)]
     drawable = [figure for figure in study.figures if of_tasks(study, figure)]  # a study may have some of its tasks
     for i, figure in enumerate(drawable):
@@ -63,7 +63,7 @@ def write_report(study: Study, runs: Path, folder: Path, say: Say = print) -> Pa
             parts.append(f"Figure {i + 1} ({figure.kind}) could not be drawn: {error}\n")
             continue
         parts.append(f"![{figure.title or figure.kind}]({stem.name})\n\n*Figure {i + 1}. {caption}*\n")
-    parts += [_tables(study, rows), _commands(study, rows, folder)]
+    parts += [_tables(study, rows), _commands(study, rows)]
     path = folder / REPORT_FILE
     partial = path.with_suffix(".partial")
     partial.write_text("\n".join(parts), encoding="utf-8")
@@ -115,14 +115,14 @@ def _poses(study: Study, figure: Figure, rows: Sequence[Row], say: Say) -> dict[
     found = {}
     tasks = of_tasks(study, figure)
     for row in rows:
-        if row.job.seed == 0 and row.job.task in tasks:
+        if row.folder is not None and row.job.seed == 0 and row.job.task in tasks:
             try:
                 found[row.job.task, row.job.variant.name] = poses_at(row.folder)
             except RenderingError as error:
                 say(f"no pictures: {error}")
                 found[row.job.task, row.job.variant.name] = poses_at(row.folder, render=False)
     if not found:
-        raise ConfigError(f"no run of seed 0 of {', '.join(tasks)} is there yet")
+        raise ConfigError(f"no run of seed 0 of {', '.join(tasks)} is here")
     return found
 
 
@@ -259,7 +259,7 @@ def _mean(sample: np.ndarray, figure: str) -> str:
     return f"{factor * sample.mean():.{digits}f}{spread}{unit}"
 
 
-def _commands(study: Study, rows: Sequence[Row], folder: Path) -> str:
+def _commands(study: Study, rows: Sequence[Row]) -> str:
     lines = [
         "## Commands",
         "",
@@ -271,20 +271,10 @@ def _commands(study: Study, rows: Sequence[Row], folder: Path) -> str:
     ]
     lines += [
         f"| {row.job.variant.label} | {row.job.task} | {row.job.seed} | {row.frames} | {row.minutes:.1f} | "
-        f"`hdmi train {_shown(row, folder)}` |"
+        f"`{command_of(row)}` |"
         for row in rows
     ]
     return "\n".join(lines) + "\n"
-
-
-def _shown(row: Row, folder: Path) -> str:
-    """The arguments of a run, folders of this machine as seen from the report."""
-    texts = []
-    for text in row.arguments:
-        key, _, value = text.partition("=")
-        path = os.path.relpath(value, folder) if key == "motion_root" else value
-        texts.append(f"{key}={path}")
-    return " ".join(texts)
 
 
 def _seeds(study: Study, rows: Sequence[Row]) -> str:
