@@ -12,7 +12,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 from tensordict import NestedKey
-from torchrl.envs import Transform
+from torchrl.envs import Transform, TransformedEnv
 
 from hdmi.assets import (
     Effector,
@@ -34,7 +34,7 @@ from hdmi.motion import Reference, find_motion, make_reference
 from hdmi.motion.dynamics import reference_torque
 from hdmi.motion.starts import StartTables, start_tables
 from hdmi.order import check_order, check_reads, listed_keys, read_keys
-from hdmi.transforms import KernelReward, KernelTermination, RewardTerm
+from hdmi.transforms import Concatenate, KernelReward, KernelTermination, RewardTerm
 
 # What leaves the stack besides the state that steps read back.
 OUTPUTS = (
@@ -230,6 +230,19 @@ def make_env(
     wanted = [key for key in entries if key in state or _top(key) in OUTPUTS]
     env.append_transform(Keep([*wanted, *env.reward_keys, *env.done_keys]))
     return env
+
+
+def network_inputs(env: TransformedEnv) -> dict[str, dict[str, int]]:
+    """What networks are given by an environment: output of each `Concatenate` -> term -> width, in order."""
+    found = {}
+    for transform in env.transform:
+        if isinstance(transform, Concatenate):
+            spec = transform.parent.full_observation_spec
+            terms = {
+                "/".join((key,) if isinstance(key, str) else key): spec[key].shape[-1] for key in transform.in_keys
+            }
+            found[str(transform.out_keys[0])] = terms
+    return found
 
 
 def _top(key: Any) -> str:

@@ -49,7 +49,7 @@ def train(cfg: DictConfig) -> None:
         f"observations {trainer.sizes}, run folder {folder}",
         soft_wrap=True,
     )
-    for note in notes:
+    for note in [*notes, *(f"from {cfg.warm_start}: {taken}" for taken in trainer.taken)]:
         console.print(note, soft_wrap=True, markup=False)
     try:
         trainer.run(partial(finish, cfg, folder, console))

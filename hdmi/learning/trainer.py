@@ -29,7 +29,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.utils import KLAdaptiveLR
 from torchrl.objectives.value import GAE
 
-from hdmi.assembly import Task, make_task
+from hdmi.assembly import Task, make_task, network_inputs
 from hdmi.config import ConfigError, build, one_line
 from hdmi.console import make_console
 from hdmi.learning.checkpoint import CheckpointError, claim, load_checkpoint, rotate, save_checkpoint, supersede
@@ -38,6 +38,7 @@ from hdmi.learning.logger import RunLogger
 from hdmi.learning.networks import bound_noise, network_of, normalised_actor, normalised_critic
 from hdmi.learning.policy import make_networks
 from hdmi.learning.resume import CONFIG_FILE, problem_changes
+from hdmi.learning.warm_start import Taken, take_over
 from hdmi.motion import find_motion
 from hdmi.threads import set_threads
 
@@ -89,6 +90,8 @@ class Trainer:
         policy: from deployable observations.
         actor: that acts in training: the policy.
         averaged: `averaged.module` is the policy that leaves the training.
+        inputs: terms of each network's observation and their widths.
+        taken: what a warm start took over.
         groups: of rewards that the critic values each by itself, in the order of its heads; none for one head.
 
     Raises:
@@ -154,11 +157,32 @@ class Trainer:
         self.frames_per_batch = cfg.num_envs * algo.frames_per_env  # of this rank
         self.iteration = self.frames = 0
         self.bad_updates = self.lost_checkpoints = 0
+        self.taken: list[Taken] = []  # by a warm start
         self.elapsed = 0.0  # s of collection and learning
         self._warm_up()
+        self.inputs = network_inputs(self.env)
+        if state is None and cfg.warm_start is not None:
+            self._warm_start(cfg.warm_start)
         self.collector.start(self.actor)
         if state is not None:
             self.restore(state)
+
+    def _warm_start(self, path: str) -> None:
+        """Takes networks over from a run or an exported policy; what it has no critic for begins anew."""
+        state = load_checkpoint(path, self.device)
+        if "inputs" not in state:
+            raise CheckpointError(
+                f"warm_start: {path}: made by an older version, which did not write what networks see"
+            )
+        networks = {"policy": ("actor", self.policy), "critic": ("critic", self.critic)}
+        if self.actor is not self.policy:
+            raise CheckpointError("warm_start: algo=teacher_student trains another network first; it starts from none")
+        self.taken = [
+            take_over(network, state[entry], self.inputs[name], state["inputs"][name], name)
+            for name, (entry, network) in networks.items()
+            if entry in state
+        ]
+        self.averaged.module.load_state_dict(self.policy.state_dict())
 
     # -- one iteration ----------------------------------------------------------------------------------------
 
@@ -419,6 +443,7 @@ class Trainer:
             "task": self.task.name,
             "motion": self.motion_digest,
             "sizes": self.sizes,
+            "inputs": self.inputs,
             "iteration": self.iteration,
             "frames": self.frames,
             "elapsed": self.elapsed,
