@@ -74,6 +74,12 @@ def test_the_laptop_preset_is_what_lift_box_has():
         assert name not in strict or node == embedded.termination[name]
 
 
+def test_without_the_body_termination_no_early_end_stands_in_for_it():
+    cfg = load_config("task=walk", "+ablation=no_residual_no_body_termination")
+    assert cfg.early_end.early_body_pose is None
+    assert cfg.early_end.early_root_pose is not None
+
+
 def test_rows_of_the_tables_that_are_config_alone():
     """Kernels bound to keys, with parameters: the table at the start names them."""
     cfg = load_config(
