@@ -87,7 +87,7 @@ def _draw(study: Study, figure: Figure, rows: Sequence[Row], runs: Path, stem: P
     elif figure.kind == "summary":
         drawn = draw_summary(study, figure, rows)
         said = (
-            f"{_capital(what)} over {len(tasks)} task{'s' * (len(tasks) > 1)}: interquartile mean over runs, "
+            f"{_capital(what)} over {_counted(len(tasks), 'task')}: interquartile mean over runs, "
             f"{CONFIDENCE:.0%} stratified bootstrap interval; {n}."
         )
     elif figure.kind == "curves":
@@ -169,8 +169,9 @@ def _head(study: Study, rows: Sequence[Row]) -> str:
         "",
         study.question.strip(),
         "",
-        f"{len(rows)} of {whole} trainings are there: {len(study.variants)} variants, {len(study.tasks)} tasks, "
-        f"{study.seeds} seeds, {_millions(study)} frames each; {frames / 1e6:.1f} M frames and {minutes:.0f} minutes "
+        f"{len(rows)} of {whole} trainings are there: {_counted(len(study.variants), 'variant')}, "
+        f"{_counted(len(study.tasks), 'task')}, {_counted(study.seeds, 'seed')}, {_millions(study)} frames each; "
+        f"{frames / 1e6:.1f} M frames and {minutes:.0f} minutes "
         "of collection and learning altogether. Evaluations are of "
         f"{study.num_envs} episodes from the first frame, under the terminations of the task "
         f"({'; '.join(condition_of(name) for name in study.without)}), with the starts of the training.",
@@ -284,7 +285,11 @@ def _seeds(study: Study, rows: Sequence[Row]) -> str:
         for task in study.tasks
     }
     low, high = min(counts), max(counts)
-    return f"n = {low} seed{'s' * (low != 1)} each" if low == high else f"n = {low} to {high} seeds each"
+    return f"n = {_counted(low, 'seed')} each" if low == high else f"n = {low} to {high} seeds each"
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
 
 
 def _millions(study: Study) -> str:
