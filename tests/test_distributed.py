@@ -46,6 +46,7 @@ def work(folder: Path) -> None:
     run = {"weights": weights(trainer), "frames": trainer.frames, "qpos": qpos}
 
     Trainer(config("total_frames=64"), folder / "half").run()
+    torch.distributed.barrier()  # the first rank writes the checkpoint, the other one would look for it too early
     trainer = Trainer(config(f"resume={folder / 'half'}"), folder / "half")
     trainer.run()
     resumed = {"weights": weights(trainer), "qpos": trainer.env.base_env.get_state()["backend", "data/qpos"]}
