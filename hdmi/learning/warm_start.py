@@ -54,8 +54,8 @@ def take_over(network: nn.Module, weights: Mapping[str, Tensor], inputs: Inputs,
     to = [column for term in shared for column in here[term]]
     out_of = [column for term in shared for column in there[term]]
     if set(weights) != set(own):
-        other = ", ".join(sorted(set(weights) ^ set(own)))
-        raise CheckpointError(f"warm_start: the {name} has other parts than the config's: {other}")
+        apart = ", ".join(sorted(set(weights) ^ set(own)))
+        raise CheckpointError(f"warm_start: the {name} has other parts than the config's: {apart}")
     for key, value in own.items():
         other = weights[key]
         if key == first:
