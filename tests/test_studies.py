@@ -444,6 +444,7 @@ def test_poses_compare_the_robot_with_the_reference_at_its_lowest_frame(tmp_path
     heights = lift_box().reference.body_pos[:, 0, 2]
     assert heights[frame] == heights.min()
     poses = poses_at(run, frame=10)
+    assert poses.reference_root == pytest.approx(float(heights[10]), abs=1e-5)  # of that frame, not of the last one
     assert poses.frame == 10
     assert poses.picture.shape == (480, 640, 3)
     assert 0.2 < poses.reference < 0.4  # of a standing G1's knees

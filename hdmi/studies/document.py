@@ -57,7 +57,7 @@ def write_report(study: Study, runs: Path, folder: Path, say: Say = print) -> Pa
     drawable = [figure for figure in study.figures if of_tasks(study, figure)]  # a study may have some of its tasks
     for i, figure in enumerate(drawable):
         try:
-            stem, caption = _draw(study, figure, rows, runs, folder / f"figure_{i + 1}_{figure.kind}", say)
+            stem, caption = _draw(study, figure, rows, folder / f"figure_{i + 1}_{figure.kind}", say)
         except _PROBLEMS as error:
             say(f"figure {i + 1}, {figure.kind}: {error}")
             parts.append(f"Figure {i + 1} ({figure.kind}) could not be drawn: {error}\n")
@@ -74,16 +74,14 @@ def write_report(study: Study, runs: Path, folder: Path, say: Say = print) -> Pa
 # -- figures --------------------------------------------------------------------------------------------------
 
 
-def _draw(study: Study, figure: Figure, rows: Sequence[Row], runs: Path, stem: Path, say: Say) -> tuple[Path, str]:
+def _draw(study: Study, figure: Figure, rows: Sequence[Row], stem: Path, say: Say) -> tuple[Path, str]:
     """Draws a figure; returns its path and caption."""
     tasks, n = of_tasks(study, figure), _seeds(study, rows)
     what = label_of(figure.of)
     interval = f"{CONFIDENCE:.0%} bootstrap interval over seeds"
     if figure.kind == "bars":
         drawn = draw_bars(study, figure, rows)
-        said = (
-            f"{_capital(what)} after {_millions(study)} frames, interquartile mean and {interval}, a dot a seed; {n}."
-        )
+        said = f"{_capital(what)} after {_millions(study)} frames, interquartile mean and {interval}; a dot is a seed, {n}."
     elif figure.kind == "summary":
         drawn = draw_summary(study, figure, rows)
         said = (

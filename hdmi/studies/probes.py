@@ -62,7 +62,7 @@ def poses_at(run: Path, frame: int | None = None, bodies: str = ".*knee.*", rend
         render: whether a picture is wanted.
 
     Raises:
-        CheckpointError, ConfigError, MotionError: if it cannot be played here.
+        CheckpointError, ConfigError, MotionError: if it cannot be played here, or its world diverges before.
         RenderingError: without OpenGL, where a picture is wanted.
     """
     actor, cfg, _ = load_policy(run)
@@ -70,13 +70,15 @@ def poses_at(run: Path, frame: int | None = None, bodies: str = ".*knee.*", rend
     task = make_task(cfg)
     frame = deepest_frame(task) if frame is None else frame
     ids = _bodies(task, bodies)
-    (still,) = (moment for moment in replay(task, frame) if moment.frame == frame)
+    still = next(replay(task, frame))
     with torch.random.fork_rng():
         torch.manual_seed(0)
         env = make_evaluation_env(cfg, task, 1)
         try:
             policy = on_device(actor, env.device)
-            moment = next(moment for moment in play(env, task, policy, ()) if moment.frame == frame)
+            moment = next((moment for moment in play(env, task, policy, ()) if moment.frame == frame), None)
+            if moment is None:
+                raise ConfigError(f"{run}: its world diverges before frame {frame}")
             image = _photograph(task, moment) if render else None
             return Poses(
                 frame, image, _lowest(moment, ids), _lowest(still, ids), _root(task, moment), _root(task, still)

@@ -59,8 +59,8 @@ def run_study(study: Study, runs: Path, folder: Path, jobs: int = 2, say: Say = 
     """Trains and evaluates a study, several trainings at a time, each in a process of its own.
 
     What is there is not trained again, nor what the rows of an earlier report have; what was interrupted continues.
-    Variants that are trained on a recorded motion
-    come last: the best run of the variant that they name is played and recorded, once for each task.
+    Variants that are trained on a recorded motion come last: the best run of the variant that they name is played and
+    recorded, once for each task.
 
     Args:
         runs: folder of the run folders, which studies may share.
