@@ -81,7 +81,9 @@ def _draw(study: Study, figure: Figure, rows: Sequence[Row], stem: Path, say: Sa
     interval = f"{CONFIDENCE:.0%} bootstrap interval over seeds"
     if figure.kind == "bars":
         drawn = draw_bars(study, figure, rows)
-        said = f"{_capital(what)} after {_millions(study)} frames, interquartile mean and {interval}; a dot is a seed, {n}."
+        said = (
+            f"{_capital(what)} after {_millions(study)} frames, interquartile mean and {interval}; dots are seeds, {n}."
+        )
     elif figure.kind == "summary":
         drawn = draw_summary(study, figure, rows)
         said = (
