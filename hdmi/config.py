@@ -80,6 +80,22 @@ def plain_container(node: Any) -> dict[str, Any]:
     return values
 
 
+def run_container(cfg: DictConfig) -> dict[str, Any]:
+    """A run's config as plain values, interpolations resolved, but for `motion_root`.
+
+    `motion_root='${oc.env:HDMI_MOTIONS}'` stays so in what leaves the machine, and is looked up where it is used.
+
+    Examples:
+        >>> cfg = OmegaConf.create({"seed": 1, "device": "${seed}", "motion_root": "${oc.env:HOME}"})
+        >>> run_container(cfg)
+        {'seed': 1, 'device': 1, 'motion_root': '${oc.env:HOME}'}
+    """
+    values = plain_container(cfg)
+    if "motion_root" in values:
+        values["motion_root"] = OmegaConf.to_container(cfg, resolve=False)["motion_root"]  # type: ignore[index, call-overload]
+    return values
+
+
 def build_dataclass(cls: type, node: Any, where: str) -> Any:
     """A dataclass from a config node, or from a mapping, of its fields.
 

@@ -74,6 +74,7 @@ class TestErrors:
             ({"torso": [{"at": 0, "bow": 1}]}, ["torso[0]", "unknown 'bow'", "lean, gaze, roll"]),
             ({"feet": [{"start": 0}]}, ["feet[0]", "either 'walk' or 'step'"]),
             ({"feet": [{"walk": [[1, 0]], "start": 0, "end": 1}]}, ["feet[0].walk[0]", "3 numbers"]),
+            ({"feet": [{"walk": [[1, 0, 0]], "start": 0, "end": 1, "step_time": 0}]}, ["feet[0]", "more than 0"]),
             ({"feet": [{"step": "tail", "start": 0, "end": 1, "to": [0, 0, 0]}]}, ["feet[0].step", "left or right"]),
             ({"feet": [{"step": "left", "start": 1, "end": 1, "to": [0, 0, 0]}]}, ["feet[0]", "is not after start"]),
             ({"object": {"carried": [0, 2, 1, 3]}}, ["object.carried", "must not decrease"]),
@@ -188,17 +189,25 @@ class TestKeys:
 
 class TestFootsteps:
     def test_a_walk_straight_ahead(self):
-        walk = {"walk": [[0.5, 0, 0]], "start": 0.5, "end": 3.5, "length": 0.25}
+        walk = {"walk": [[0.5, 0, 0]], "start": 0.5, "end": 3.5, "length": 0.25, "step_time": 1}
         steps = plan_steps(plan(feet=[walk]))
         assert [step.side for step in steps] == ["left", "right", "left"]
         np.testing.assert_allclose([step.to for step in steps], [[0.25, HALF, 0], [0.5, -HALF, 0], [0.5, HALF, 0]])
         np.testing.assert_allclose([(step.start, step.end) for step in steps], [(0.75, 1.5), (1.75, 2.5), (2.75, 3.5)])
 
     def test_a_turn_to_the_right_begins_with_the_right_foot(self):
-        walk = {"walk": [[0, 0, -0.8]], "start": 0, "end": 3, "turn": 0.4}
+        walk = {"walk": [[0, 0, -0.8]], "start": 0, "end": 3, "turn": 0.4, "step_time": 1}
         steps = plan_steps(plan(feet=[walk]))
         assert [step.side for step in steps] == ["right", "left", "right"]
         np.testing.assert_allclose(steps[0].to, [-HALF * np.sin(0.4), -HALF * np.cos(0.4), -0.4])
+
+    def test_there_are_as_many_steps_as_there_is_time_for(self):
+        walk = {"walk": [[0.5, 0, 0], [0.5, 0, 0.4]], "start": 0, "end": 4.5, "length": 0.25, "turn": 0.4}
+        steps = plan_steps(plan(feet=[walk | {"step_time": 0.5}]))
+        np.testing.assert_allclose([step.end for step in steps], np.arange(0.5, 4.6, 0.5))
+        turned = [step.to[2] for step in steps]  # five ahead and three turns, from 2 and 1, and one to stand
+        np.testing.assert_allclose(turned, [0, 0, 0, 0, 0, 0.4 / 3, 0.8 / 3, 0.4, 0.4], atol=1e-12)
+        assert steps[0].to[0] == pytest.approx(0.1)
 
     def test_a_walk_continues_where_the_feet_are(self):
         first = {"walk": [[0.2, 0, 0]], "start": 0, "end": 1}

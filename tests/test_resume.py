@@ -26,6 +26,7 @@ from hdmi.learning import CheckpointError, Trainer, load_checkpoint, save_checkp
 from hdmi.learning.checkpoint import checkpoints
 from hdmi.learning.logger import RunLogger
 from hdmi.learning.resume import differences, find_run, problem_changes
+from hdmi.motion import find_motion
 
 # worlds are reset often: what is drawn for them would show
 SHORT = [*TINY, "task.episode_steps=5", "total_frames=96"]
@@ -159,6 +160,17 @@ class TestContinuation:
         assert find_run(folder)[1].name == "checkpoint_000002.pt"
         train(f"resume={folder}", "total_frames=96")
         assert_same_weights(newest, load_checkpoint(folder))
+
+    def test_the_folder_of_motions_stays_as_it_was_typed(
+        self, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("HERE", str(find_motion("lift_box").parent))
+        cfg = OmegaConf.create(load_checkpoint(run)["config"])
+        cfg.resume, cfg.motion_root = str(run), "${oc.env:HERE}"
+        trainer = Trainer(cfg, tmp_path)
+        trainer.save()
+        trainer.collector.shutdown()
+        assert load_checkpoint(tmp_path)["config"]["motion_root"] == "${oc.env:HERE}"
 
     def test_another_problem_continues_the_networks_if_told_to(self, run: Path, tmp_path: Path) -> None:
         cfg = OmegaConf.create(load_checkpoint(run)["config"])

@@ -435,6 +435,18 @@ class TestFeedForwardTarget:
             with pytest.raises(ValueError, match=f"effort: expected a share from 0 to 1, got {effort}"):
                 T.FeedForwardTarget(reference, torque, **servos, effort=effort)
 
+    def test_lead_is_how_far_ahead_they_are(self, reference):
+        servos = {"servo_stiffness": [100.0] * 29, "servo_damping": [0.0] * 29, "effort_limits": [50.0] * 29}
+        pos = torch.arange(5.0)[:, None].square().expand(5, 29)  # 0, 1, 4, 9, 16
+        moved = replace(reference, joint_pos=pos, joint_vel=torch.zeros(5, 29))
+        for lead, expected in ((0.0, [0, 1, 4, 9, 16]), (0.03, [2.5, 6.5, 12.5, 16, 16]), (0.04, [4, 9, 16, 16, 16])):
+            term = T.FeedForwardTarget(moved, torch.zeros(5, 29), **servos, lead=lead, control_dt=0.02)
+            close(term.targets[:, 0], torch.tensor(expected))
+        own = replace(reference, joint_target=reference.joint_pos)  # what was sent was sent in time
+        close(T.FeedForwardTarget(own, torch.zeros(1), **servos, lead=0.03).targets, reference.joint_pos)
+        with pytest.raises(ValueError, match="lead: expected seconds, not below 0, got -0.01"):
+            T.FeedForwardTarget(moved, torch.zeros(5, 29), **servos, lead=-0.01)
+
 
 class TestSpringAssist:
     def env(self, reference, *bodies: str, start: int = 0, **kwargs):

@@ -21,7 +21,7 @@ from rich.markup import escape
 
 from hdmi.assembly import describe, make_transforms
 from hdmi.commands.script import USER_ERRORS, run_composed
-from hdmi.config import CONF
+from hdmi.config import CONF, run_container
 from hdmi.console import make_console
 from hdmi.envs.rendering import RenderingError
 from hdmi.evaluation import evaluate_checkpoint, render_checkpoint
@@ -101,7 +101,7 @@ def open_run(cfg: DictConfig) -> tuple[DictConfig, Path, list[str]]:
     with open_dict(cfg):
         cfg.merge_with(call)
     notes = [f"continues from iteration {state['iteration']}, {checkpoint}, under the run's config, but for:"]
-    changes = differences(state["config"], OmegaConf.to_container(cfg, resolve=True))
+    changes = differences(state["config"], run_container(cfg))
     notes += [f"  {path}: {_short(old)} -> {_short(new)}" for path, (old, new) in changes.items()]
     if not changes:
         notes = [notes[0].removesuffix(", but for:")]

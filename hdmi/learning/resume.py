@@ -14,7 +14,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hdmi.config import ConfigError
+from hdmi.config import ConfigError, run_container
 from hdmi.learning.checkpoint import POLICY_FILE, CheckpointError, checkpoints, find_checkpoint
 
 CONFIG_FILE = "config.yaml"
@@ -106,13 +106,13 @@ def continued_config(
     given = parser.parse_overrides(list(typed))
     added = [override for override in given if override.key_or_group not in {*_OF_THE_CALL, *KEPT}]
     try:
-        before = _container(compose(overrides))
+        before = run_container(compose(overrides))
     except (HydraException, OmegaConfBaseException):  # the config has changed since
         overrides = [f"task={run['task']['name']}"]
-        before = _container(compose(overrides))
+        before = run_container(compose(overrides))
     merged = _merged(parser.parse_overrides(overrides), added)
     try:
-        after = _container(compose(merged))
+        after = run_container(compose(merged))
     except (HydraException, OmegaConfBaseException) as error:
         reason = str(error).splitlines()[0]
         raise ConfigError(f"resume: {reason} (the run was made with {' '.join(overrides) or 'no options'})") from error
@@ -131,11 +131,6 @@ def continued_config(
     made = OmegaConf.create(config)
     assert isinstance(made, DictConfig)
     return made
-
-
-def _container(cfg: DictConfig) -> dict[str, Any]:
-    values: Any = OmegaConf.to_container(cfg, resolve=True)
-    return values
 
 
 def _merged(before: Sequence[Override], added: Sequence[Override]) -> list[str]:

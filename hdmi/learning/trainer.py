@@ -30,7 +30,7 @@ from torchrl.objectives.utils import KLAdaptiveLR
 from torchrl.objectives.value import GAE
 
 from hdmi.assembly import Task, make_task, network_inputs
-from hdmi.config import ConfigError, build, one_line
+from hdmi.config import ConfigError, build, one_line, run_container
 from hdmi.console import make_console
 from hdmi.learning.checkpoint import CheckpointError, claim, load_checkpoint, rotate, save_checkpoint, supersede
 from hdmi.learning.distributed import Ranks
@@ -439,7 +439,7 @@ class Trainer:
         if not self.ranks.is_first:
             return
         state = {
-            "config": OmegaConf.to_container(self._config_of_run(), resolve=True),
+            "config": run_container(self._config_of_run()),
             "task": self.task.name,
             "motion": self.motion_digest,
             "sizes": self.sizes,
@@ -466,8 +466,7 @@ class Trainer:
         """Refuses what cannot be continued, before anything is built."""
         if "critic" not in state:
             raise CheckpointError("resume: an exported policy, without critic and optimizers; it cannot be continued")
-        config: Any = OmegaConf.to_container(self.cfg, resolve=True)
-        self._changed = problem_changes(state["config"], config)
+        self._changed = problem_changes(state["config"], run_container(self.cfg))
         if self._changed and not self.cfg.resume_anyway:
             raise CheckpointError(
                 f"resume: {', '.join(self._changed)}: not as in the run, which would be another experiment; leave that "

@@ -21,7 +21,8 @@ class FeedForwardTarget(FunctionTransform):
 
     Soft servos sent to the reference's joint positions give way to whatever they carry. These targets are ahead by
     what the reference's torques and velocities ask for, see `functional.feedforward_target`; where the motion brings
-    targets of its own, it is those.
+    targets of its own, it is those. What is sent acts late, by the action's delay and half of a control step; `lead`
+    sends what the reference asks for by then.
 
     Reads `step_key` int64 [N, 1], the frame of the reference; writes `out_key` [N, J], rad.
 
@@ -31,6 +32,8 @@ class FeedForwardTarget(FunctionTransform):
         servo_stiffness, servo_damping: of the servos, N m/rad and N m s/rad. [J]
         effort_limits: of the motors, N m. [J]
         effort: share of the limits that the torques are clipped to: the rest is the policy's.
+        lead: how far ahead on the motion the targets are, s; not those that the motion brings, which were sent in time.
+        control_dt: s.
 
     Examples:
         >>> servos = {"servo_stiffness": [100.0] * 29, "servo_damping": [2.0] * 29, "effort_limits": [50.0] * 29}
@@ -50,12 +53,16 @@ class FeedForwardTarget(FunctionTransform):
         servo_damping: Sequence[float],
         effort_limits: Sequence[float],
         effort: float = 0.8,
+        lead: float = 0.0,
+        control_dt: float = 0.02,
         step_key: NestedKey = ("ref", "step"),
         out_key: NestedKey = ("ref", "joint_target"),
     ):
         super().__init__([step_key], [out_key])
         if not 0 <= effort <= 1:
             raise ValueError(f"effort: expected a share from 0 to 1, got {effort}")
+        if lead < 0:
+            raise ValueError(f"lead: expected seconds, not below 0, got {lead}")
         targets = reference.joint_target
         if targets is None:
             torque = joint_torque() if callable(joint_torque) else joint_torque
@@ -65,7 +72,16 @@ class FeedForwardTarget(FunctionTransform):
             )
             torque = torque.to(reference.joint_pos)
             targets = feedforward_target(reference.joint_pos, reference.joint_vel, torque, kp, kd, effort * limit)
+            targets = _ahead(targets, lead / control_dt)
         self.register_buffer("targets", targets, persistent=False)
 
     def function(self, *inputs: Tensor) -> Tensor:
         return self.targets[inputs[0].squeeze(-1)]
+
+
+def _ahead(values: Tensor, frames: float) -> Tensor:
+    """Values [T, J] so many frames later, in between linearly; those of the last frame at the end."""
+    whole = int(frames)
+    index = torch.arange(len(values), device=values.device) + whole
+    early, late = (values[(index + i).clamp(max=len(values) - 1)] for i in (0, 1))
+    return torch.lerp(early, late, frames - whole)

@@ -20,6 +20,7 @@ SOLE_CENTRE = 0.03  # of pressure while standing, ahead of the ankles, m
 MIN_STEP_TIME = 0.4  # s
 SHIFT_TIME = 0.6  # in which the weight goes onto one foot from standing, and back, s
 ROOT_SMOOTHING = 0.3  # s
+OVER_PLACE = 0.85  # share of a swing after which the foot is over where it lands: if it lands early, it lands there
 
 _LEFT = {"left": 1.0, "right": -1.0}
 
@@ -27,8 +28,9 @@ _LEFT = {"left": 1.0, "right": -1.0}
 def plan_steps(plan: Plan) -> list[Step]:
     """All steps in order of time; walks become steps.
 
-    The root path of a walk goes straight from waypoint to waypoint in strides of at most `length` and `turn`; feet land
-    beside it, left and right in turn, and the last step brings them side by side at its end.
+    The root path of a walk goes straight from waypoint to waypoint in strides of at most `length` and `turn`, and in as
+    many as there is time for at `step_time` each; feet land beside it, left and right in turn, and the last step brings
+    them side by side at its end.
 
     Raises:
         PlanError: for steps that overlap in time or are shorter than `MIN_STEP_TIME`.
@@ -65,16 +67,17 @@ def _beside(root: np.ndarray, side: str, width: float) -> np.ndarray:
 
 
 def _walk(walk: Walk, start: np.ndarray, width: float, height: float) -> list[Step]:
-    roots, here = [], start
-    for waypoint in walk.path:
-        there = np.array(waypoint)
-        count = max(
-            1,
-            int(np.ceil(np.linalg.norm(there[:2] - here[:2]) / walk.length - 1e-6)),
-            int(np.ceil(abs(there[2] - here[2]) / walk.turn - 1e-6)),
-        )
-        roots += [here + (there - here) * (i + 1) / count for i in range(count)]
-        here = there
+    legs = list(pairwise([start, *(np.array(waypoint) for waypoint in walk.path)]))
+    strides = [
+        max(np.linalg.norm(there[:2] - here[:2]) / walk.length, abs(there[2] - here[2]) / walk.turn)
+        for here, there in legs
+    ]
+    wanted = int((walk.end - walk.start) / walk.step_time + 1e-6) - 1
+    roots = [
+        here + (there - here) * (i + 1) / count
+        for (here, there), count in zip(legs, _step_counts(strides, wanted), strict=True)
+        for i in range(count)
+    ]
     roots.append(roots[-1])
     first = walk.first or ("left" if _sideways(start, np.array(walk.path[0])) >= 0 else "right")
     order = [first, "right" if first == "left" else "left"]
@@ -91,6 +94,15 @@ def _walk(walk: Walk, start: np.ndarray, width: float, height: float) -> list[St
         x, y, yaw = (float(value) for value in _beside(root, side, width))
         steps.append(Step(side, begin + walk.double_support * period, begin + period, (x, y, yaw), height, walk.height))
     return steps
+
+
+def _step_counts(strides: Sequence[float], wanted: int) -> list[int]:
+    """Steps for each leg of a walk: as many as its strides of full length, and more up to the number wanted in all,
+    each where steps are longest."""
+    counts = [max(1, int(np.ceil(stride - 1e-6))) for stride in strides]
+    while sum(counts) < wanted:
+        counts[int(np.argmax([stride / count for stride, count in zip(strides, counts, strict=True)]))] += 1
+    return counts
 
 
 def _sideways(start: np.ndarray, there: np.ndarray) -> float:
@@ -146,7 +158,7 @@ def foot_path(
             path = PosePath(np.where(swing[:, None], swung.pos, path.pos), Rotation.from_quat(rot))
         else:
             u = np.clip((time - step.start) / (step.end - step.start), 0.0, 1.0)
-            path.pos[:, 2] += step.height * 64 * (u * (1 - u)) ** 3
+            path.pos[:, 2] += step.height * 16 * (u * (1 - u)) ** 2
     return _raise_heel(path, value_path(plan.heels.get(side, ()), "pitch", time, 0.0)), contact
 
 
@@ -159,7 +171,7 @@ def stances(steps: Sequence[Step], time: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _share(step: Step, time: np.ndarray) -> np.ndarray:
-    return minimum_jerk((time - step.start) / (step.end - step.start))[:, None]
+    return minimum_jerk((time - step.start) / (OVER_PLACE * (step.end - step.start)))[:, None]
 
 
 def _via_path(

@@ -8,7 +8,8 @@ from the key before it; between keys everything moves with minimum jerk and rest
 | duration   | of the motion                                                                                       |
 | phases     | names for times: `{reach: 0.2, lift: 1.6}`                                                          |
 | start      | the feet side by side: `{pos: [x, y, z], yaw: 0, width: 0.238}`                                     |
-| feet       | `{walk: [[x, y, yaw], ...], start, end, length, turn, first, height, z}`: steps along a root path;  |
+| feet       | `{walk: [[x, y, yaw], ...], start, end, length, turn, step_time, first, height, z}`: steps along a  |
+|            | root path;                                                                                          |
 |            | `{step: left, start, end, to: [x, y, yaw], z, height, via: [pose keys]}`: one foot, on a way of its own|
 | heels      | `{left: [{at, pitch}]}`: heel raised by turning about the toes                                       |
 | pelvis     | `{at, height, pitch}`: above the ground under the feet                                              |
@@ -113,6 +114,7 @@ class Walk:
     turn: float = 0.4
     first: str | None = None
     height: float = 0.06
+    step_time: float = 0.45  # s; slower ones need a balance between steps that soft ankles do not have
     double_support: float = 0.25  # share of a step's time
     z: float | None = None  # of the ground that it leads onto; where the feet are if absent
     where: str = field(default="", compare=False)
@@ -294,7 +296,7 @@ def _foot_item(node: _Node) -> Step | Walk:
     if ("walk" in node.value) == ("step" in node.value):
         raise PlanError(f"{node.where}: give either 'walk' or 'step'")
     if "walk" in node.value:
-        node.only("walk", "start", "end", "length", "turn", "first", "height", "double_support", "z")
+        node.only("walk", "start", "end", "length", "turn", "first", "height", "step_time", "double_support", "z")
         path = node.get("walk")
         if not isinstance(path, Sequence) or isinstance(path, str) or not path:
             raise PlanError(f"{node.at('walk')}: expected a list of [x, y, yaw], got {path!r}")
@@ -309,6 +311,7 @@ def _foot_item(node: _Node) -> Step | Walk:
             turn=node.number("turn", 0.4),
             first=first,
             height=node.number("height", 0.06),
+            step_time=node.number("step_time", 0.45),
             double_support=node.number("double_support", 0.25),
             z=node.number("z") if "z" in node.value else None,
             where=node.where,
@@ -329,6 +332,8 @@ def _foot_item(node: _Node) -> Step | Walk:
         )
     if not item.end > item.start:
         raise PlanError(f"{node.where}: end {item.end} s is not after start {item.start} s")
+    if isinstance(item, Walk) and not min(item.length, item.turn, item.step_time) > 0:
+        raise PlanError(f"{node.where}: length, turn and step_time: expected more than 0")
     return item
 
 
