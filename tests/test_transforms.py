@@ -444,7 +444,7 @@ class TestFeedForwardTarget:
             close(term.targets[:, 0], torch.tensor(expected))
         own = replace(reference, joint_target=reference.joint_pos)  # what was sent was sent in time
         close(T.FeedForwardTarget(own, torch.zeros(1), **servos, lead=0.03).targets, reference.joint_pos)
-        with pytest.raises(ValueError, match="lead: expected seconds, not below 0, got -0.01"):
+        with pytest.raises(ValueError, match=r"lead: expected seconds, not below 0, got -0\.01"):
             T.FeedForwardTarget(moved, torch.zeros(5, 29), **servos, lead=-0.01)
 
 

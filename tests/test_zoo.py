@@ -17,8 +17,9 @@ from hdmi.commands import tasks
 from hdmi.config import ConfigError
 from hdmi.evaluation import EvalResult
 from hdmi.evaluation.protocol import evaluation_config
-from hdmi.learning.checkpoint import CheckpointError, save_checkpoint
+from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from hdmi.learning.policy import load_policy
+from hdmi.motion import find_motion, motion_digest
 from hdmi.tasks.queue import LOG_FILE
 from hdmi.tasks.training import Outcome, is_better, train_zoo
 from hdmi.tasks.zoo import Entry, policies, read_recipes, render_sheet, zoo_markdown, zoo_rows
@@ -98,13 +99,20 @@ class Commands:
     def train(self, run: Path, overrides: list[str], frames: int = 100, num_envs: int = 256) -> None:
         """Leaves what a training does."""
         config = {"total_frames": 100, "overrides": overrides}
-        save_checkpoint(run / "checkpoints" / f"checkpoint_{frames:06d}.pt", {"frames": frames, "config": config})
+        state = {"frames": frames, "config": config, "motion": "of today"}
+        save_checkpoint(run / "checkpoints" / f"checkpoint_{frames:06d}.pt", state)
         evaluation(self.success[run.name], num_envs=num_envs, frames=frames).save(run / "eval.json")
 
     def verbs(self, name: str) -> list[str]:
         """What was asked for a policy, in order."""
         place = ("run_name", "resume", "checkpoint")
         return [verb for verb, options in self.calls if name in {Path(options.get(key, "")).name for key in place}]
+
+
+def policy_in(folder: Path, success: float, motion: str) -> None:
+    """A policy of a zoo and its evaluation."""
+    save_checkpoint(folder / "policy.pt", {"config": {}, "motion": motion})
+    evaluation(success, 0.95).save(folder / "eval.json")
 
 
 @pytest.fixture
@@ -131,7 +139,7 @@ def test_policies_are_trained_evaluated_and_exported(run: Callable[..., list[Out
 
 def test_only_what_is_better_is_taken_over(run: Callable[..., list[Outcome]], tmp_path: Path):
     for name in RECIPES:
-        evaluation(0.92, 0.95).save(tmp_path / "zoo" / name / "eval.json")
+        policy_in(tmp_path / "zoo" / name, 0.92, "of today")
     commands = Commands({"walk": 0.91, "lift": 0.93})
     outcomes = {outcome.name: outcome for outcome in run(commands)}
     assert not outcomes["walk"].kept
@@ -139,6 +147,12 @@ def test_only_what_is_better_is_taken_over(run: Callable[..., list[Outcome]], tm
     assert outcomes["lift"].kept
     assert commands.verbs("walk") == ["train", "evaluate"]
     assert EvalResult.load(tmp_path / "zoo" / "walk" / "eval.json")["success_rate"]["mean"] == 0.92
+
+
+def test_a_policy_for_another_motion_gives_way(run: Callable[..., list[Outcome]], tmp_path: Path):
+    policy_in(tmp_path / "zoo" / "walk", 0.98, "of yesterday")
+    outcomes = {outcome.name: outcome for outcome in run(Commands({"walk": 0.91, "lift": 0.93}))}
+    assert str(outcomes["walk"]) == "walk: success 91.0 %: taken over"
 
 
 def test_what_has_ended_is_not_trained_again_and_the_rest_continues(run: Callable[..., list[Outcome]], tmp_path: Path):
@@ -190,6 +204,13 @@ def test_mistakes_are_one_line(
     monkeypatch.chdir(tmp_path)
     assert tasks.main(arguments) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("folder", sorted(ZOO.glob("*/policy.pt")), ids=lambda path: path.parent.name)
+def test_policies_that_ship_are_for_the_motions_that_ship(folder: Path):
+    state = load_checkpoint(folder)
+    if state["config"]["motion_root"] is None:
+        assert state["motion"] == motion_digest(find_motion(state["config"]["task"]["motion"]))
 
 
 @pytest.mark.slow

@@ -79,6 +79,6 @@ def export_policy(source: str | Path, path: str | Path) -> Path:
         OSError: if the file cannot be written.
     """
     state = load_checkpoint(source)
-    kept = ("config", "task", "sizes", "inputs", "iteration", "frames", "elapsed", "actor")
+    kept = ("config", "task", "motion", "sizes", "inputs", "iteration", "frames", "elapsed", "actor")
     save_checkpoint(Path(path), {key: state[key] for key in kept if key in state})
     return Path(path)

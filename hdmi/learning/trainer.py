@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import signal
 import sys
@@ -39,7 +38,7 @@ from hdmi.learning.networks import bound_noise, network_of, normalised_actor, no
 from hdmi.learning.policy import make_networks
 from hdmi.learning.resume import CONFIG_FILE, problem_changes
 from hdmi.learning.warm_start import Taken, take_over
-from hdmi.motion import find_motion
+from hdmi.motion import find_motion, motion_digest
 from hdmi.threads import set_threads
 
 _WARMUP_STEPS = 8  # of the untrained policy, for first observation moments
@@ -127,7 +126,7 @@ class Trainer:
         seed = self.ranks.seed(cfg.seed)
         torch.manual_seed(seed)
         self.task: Task = make_task(cfg)
-        self.motion_digest = _digest(find_motion(cfg.task.motion, cfg.motion_root))
+        self.motion_digest = motion_digest(find_motion(cfg.task.motion, cfg.motion_root))
         self.collector = build(cfg.collector, "collector", cfg=cfg, task=self.task, seed=seed)
         self.env = self.collector.env
         self.env.set_seed(seed)
@@ -579,11 +578,6 @@ def _parallel(objective: torch.nn.Module) -> DistributedDataParallel:
         objective, broadcast_buffers=False, gradient_as_bucket_view=True,
         find_unused_parameters=getattr(objective, "in_turns", False),
     )  # fmt: skip
-
-
-def _digest(motion: Path) -> str:
-    """Of the files of a motion."""
-    return hashlib.sha256(b"".join((motion / name).read_bytes() for name in ("meta.json", "motion.npz"))).hexdigest()
 
 
 def _explained_variance(target: Tensor, value: Tensor) -> float:

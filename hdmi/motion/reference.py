@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -83,6 +84,19 @@ def find_motion(name: str, motion_root: str | None = None) -> Path:
         f"motion {name!r}: not under {root} (there: {', '.join(there) or 'no motions'}); "
         "set motion_root=FOLDER to the folder that holds it"
     )
+
+
+def motion_digest(folder: Path) -> str:
+    """SHA-256 of a motion's files, which tells whether two trainings track the same one.
+
+    Raises:
+        OSError: if they cannot be read.
+
+    Examples:
+        >>> len(motion_digest(find_motion("walk")))
+        64
+    """
+    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in ("meta.json", "motion.npz"))).hexdigest()
 
 
 def make_reference(

@@ -72,7 +72,8 @@ def train_zoo(
     """Trains policies, several at a time, each in processes of its own with its share of the processors.
 
     A training has the run folder `runs/<name>`: one that is there is continued, and one that has come to its end is
-    not trained again. What was trained goes into `zoo/<name>` if it is better than what is there (`is_better`).
+    not trained again. What was trained goes into `zoo/<name>` if it is better than what is there (`is_better`), or if
+    what is there tracked another motion.
 
     Args:
         recipes: name of the policy -> arguments of `hdmi train`.
@@ -120,12 +121,20 @@ def _train(
     ):
         return Outcome(name, problem)
     result = EvalResult.load(run / EVAL_FILE)
-    before = EvalResult.load(folder / EVAL_FILE) if (folder / EVAL_FILE).is_file() else None
+    before = _in_zoo(folder, run)
     if not is_better(result, before):
         return Outcome(name, "", result, before)
     if problem := run_hdmi(run, "export", f"checkpoint={run}", f"out={folder}", f"num_envs={num_envs}", "graph=false"):
         return Outcome(name, problem, result, before)
     return Outcome(name, "", result, before, kept=True)
+
+
+def _in_zoo(folder: Path, run: Path) -> EvalResult | None:
+    """The evaluation of a zoo's policy, if it tracked the motion that a run tracks: on another it says nothing."""
+    if not (folder / EVAL_FILE).is_file():
+        return None
+    old, new = (load_checkpoint(path).get("motion") for path in (folder, run))
+    return EvalResult.load(folder / EVAL_FILE) if old == new else None
 
 
 def _has_ended(run: Path, recipe: Sequence[str]) -> bool:
