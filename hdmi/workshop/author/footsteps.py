@@ -171,7 +171,8 @@ def stances(steps: Sequence[Step], time: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _share(step: Step, time: np.ndarray) -> np.ndarray:
-    return minimum_jerk((time - step.start) / (OVER_PLACE * (step.end - step.start)))[:, None]
+    swing = (1.0 if step.via else OVER_PLACE) * (step.end - step.start)  # a foot with a way of its own keeps to that
+    return minimum_jerk((time - step.start) / swing)[:, None]
 
 
 def _via_path(
