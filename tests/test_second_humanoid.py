@@ -430,7 +430,7 @@ class TestMotion:
         assert np.abs(smooth - dynamics.torque).max() < 5
 
     def test_feedforward_is_for_its_servos(self, config) -> None:
-        cfg = config("bends", "+lever=feedforward")
+        cfg = config("bends", "+lever=feedforward", "reference.target.lead=0")
         task = make_task(cfg)
         (ahead,) = (t for _, t in make_transforms(cfg, task) if isinstance(t, FeedForwardTarget))
         r, robot = task.reference, task.scene.robot
