@@ -172,6 +172,7 @@ CHANGED_BY_LEVER: dict[str, tuple[set[str], set[str], set[str]]] = {
     "root_history": ({"noise.root_reference", "history.root_reference"}, set(), set()),
     "springs": ({"assist.root"}, set(), set()),
     "springs_object": ({"assist.object"}, set(), set()),
+    "strict_root": ({"early_end.early_root_pose"}, set(), set()),
 }
 ON_BY_DEFAULT = ("early_end", "feedforward", "noise_curriculum")
 
