@@ -16,8 +16,10 @@ from hdmi.workshop.author import PlanError, author_motion, find_plan, load_plan,
 from hdmi.workshop.author.balance import COM_HEIGHT, GRAVITY, Load, centre_of_pressure, pendulum_com
 from hdmi.workshop.author.footsteps import (
     ANKLE_HEIGHT,
+    OVER_PLACE,
     SHIFT_TIME,
     SOLE_CENTRE,
+    foot_path,
     footprints,
     plan_steps,
     root_path,
@@ -208,6 +210,27 @@ class TestFootsteps:
         turned = [step.to[2] for step in steps]  # five ahead and three turns, from 2 and 1, and one to stand
         np.testing.assert_allclose(turned, [0, 0, 0, 0, 0, 0.4 / 3, 0.8 / 3, 0.4, 0.4], atol=1e-12)
         assert steps[0].to[0] == pytest.approx(0.1)
+
+    def test_a_foot_is_over_its_place_before_it_comes_down(self):
+        content = plan(feet=[{"step": "left", "start": 0.5, "end": 1.0, "to": [0.2, HALF, 0], "height": 0.06}])
+        steps, t = plan_steps(content), times()
+        prints = footprints(content, steps, t)
+        path, _ = foot_path(content, "left", steps, prints["left"], t, {})
+        late = np.flatnonzero((t > 0.5 + OVER_PLACE * 0.5) & (t < 1.0))
+        assert len(late) >= 3
+        np.testing.assert_allclose(path.pos[late, 0], 0.2, atol=1e-9)
+        assert (path.pos[late, 2] > ANKLE_HEIGHT + 1e-4).all()  # and still in the air
+        half = np.flatnonzero(np.isclose(t, 0.74) | np.isclose(t, 0.76))
+        np.testing.assert_allclose(path.pos[half, 2], ANKLE_HEIGHT + 0.06, atol=1e-3)
+        with_a_way = {
+            "step": "left",
+            "start": 0.5,
+            "end": 1.0,
+            "to": [0.2, HALF, 0],
+            "via": [{"at": 0.7, "pos": [0.1, HALF, 0.2]}],
+        }
+        slow = footprints(content, plan_steps(plan(feet=[with_a_way])), t)
+        assert slow["left"][late, 0].max() < 0.2
 
     def test_a_walk_continues_where_the_feet_are(self):
         first = {"walk": [[0.2, 0, 0]], "start": 0, "end": 1}

@@ -201,6 +201,12 @@ class TestLevers:
         assert close.reset.state.noise.joint_pos < default.reset.state.noise.joint_pos
         assert {key for key in close if close[key] != default[key]} == {"reset"}
 
+    def test_strict_root_allows_half_of_what_early_end_allows(self):
+        usual, strict = (load_config("task=walk", *lever).early_end for lever in ((), ("+lever=strict_root",)))
+        assert strict.early_root_pose.thresholds == [usual.early_root_pose.thresholds[0] / 2, 0.8]
+        strict.early_root_pose.thresholds = usual.early_root_pose.thresholds
+        assert strict == usual
+
     def test_the_paper_s_method_is_without_those_that_are_on(self):
         ours, paper = load_config("task=walk"), load_config("task=walk", *PAPER, f"+lever=[{','.join(ON_BY_DEFAULT)}]")
         assert {key for key in ours if ours[key] != paper[key]} == {"algo"}

@@ -438,6 +438,16 @@ class TestMotion:
         expected = r.joint_pos + (task.joint_torque.clamp(-0.8 * limit, 0.8 * limit) + kd * r.joint_vel) / kp
         torch.testing.assert_close(ahead.targets, expected)
 
+    def test_feedforward_leads_by_seconds_of_its_control_step(self, config) -> None:
+        cfg = config("bends", "+lever=feedforward")
+        assert cfg.reference.target.lead == 0.03
+        led, now = [], []
+        for lead, found in ((0.03, led), (0.0, now)):
+            cfg.reference.target.lead, cfg.sim.decimation = lead, 6  # 0.03 s: one frame
+            task = make_task(cfg)
+            found += [t.targets for _, t in make_transforms(cfg, task) if isinstance(t, FeedForwardTarget)]
+        torch.testing.assert_close(led[0][:-1], now[0][1:])
+
     def test_the_g1_does_not_know_it(self, folder: Path) -> None:
         with pytest.raises(MotionError, match=r"joint_names: \['hip_l_turn'"):
             make_reference(folder / "motions" / "bends", control_dt=0.02)

@@ -153,6 +153,20 @@ class TestResume:
         with pytest.raises(CheckpointError, match="an exported policy, without critic"):
             Trainer(config(f"resume={policy}"), tmp_path)
 
+    def test_an_exported_policy_does_not_say_where_it_was_trained(
+        self, trained: tuple[Trainer, Path], tmp_path: Path
+    ) -> None:
+        run = load_checkpoint(trained[1])
+        run["config"] |= {
+            "output_dir": "/here",
+            "run_name": "it",
+            "overrides": ["seed=1", "output_dir=/here", "run_name=it"],
+        }
+        save_checkpoint(tmp_path / "run.pt", {key: value for key, value in run.items() if key != "format"})
+        config = load_checkpoint(export_policy(tmp_path / "run.pt", tmp_path / "policy.pt"))["config"]
+        assert config["overrides"] == ["seed=1"]
+        assert set(run["config"]) - set(config) == {"output_dir", "run_name", "resume"}
+
     def test_after_kill_9(self, tmp_path: Path) -> None:
         command = [
             sys.executable, str(ROOT / "train.py"), *TINY, "checkpoint_interval=1", "total_frames=1000000",

@@ -209,6 +209,8 @@ def test_mistakes_are_one_line(
 @pytest.mark.parametrize("folder", sorted(ZOO.glob("*/policy.pt")), ids=lambda path: path.parent.name)
 def test_policies_that_ship_are_for_the_motions_that_ship(folder: Path):
     state = load_checkpoint(folder)
+    assert "output_dir" not in state["config"]
+    assert "output_dir" not in (folder.parent / "config.yaml").read_text()
     if state["config"]["motion_root"] is None:
         assert state["motion"] == motion_digest(find_motion(state["config"]["task"]["motion"]))
 

@@ -70,8 +70,7 @@ def _plot_curve(run: Path, path: Path) -> bool:
 def _card(state: dict, evaluations: dict[str, EvalResult], folder: Path, seed: int, curve: bool) -> str:
     """The text of README.md."""
     config, result, results = state["config"], evaluations["training"], list(evaluations.values())
-    own = ("output_dir=", "run_name=", "resume=")  # where it ran is nobody else's business
-    command = " ".join(["hdmi train", *(text for text in config.get("overrides", ()) if not text.startswith(own))])
+    command = " ".join(["hdmi train", *config.get("overrides", ())])
     figures = [one.figures() for one in results]
     rows = [
         f"| {name} | {' | '.join(_shown(name, one[name]['mean']) if name in one else '' for one in figures)} |"

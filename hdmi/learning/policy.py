@@ -12,6 +12,8 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 from hdmi.learning.checkpoint import CheckpointError, find_checkpoint, load_checkpoint, save_checkpoint
 from hdmi.learning.networks import make_actor, make_critic, use_bf16
 
+_PLACE = ("output_dir", "run_name", "resume")  # where a training ran
+
 
 def make_networks(
     cfg: DictConfig, sizes: dict[str, int], device: torch.device
@@ -71,6 +73,9 @@ def load_policy(
 def export_policy(source: str | Path, path: str | Path) -> Path:
     """Writes the policy of a checkpoint alone: weights, normalization, config and counters, for `load_policy`.
 
+    The config is without `output_dir`, `run_name` and `resume`, and so are the arguments that it was made with: where a
+    training ran is nobody else's business.
+
     Args:
         source: a run folder (its newest checkpoint counts) or a checkpoint file.
 
@@ -80,5 +85,9 @@ def export_policy(source: str | Path, path: str | Path) -> Path:
     """
     state = load_checkpoint(source)
     kept = ("config", "task", "motion", "sizes", "inputs", "iteration", "frames", "elapsed", "actor")
-    save_checkpoint(Path(path), {key: state[key] for key in kept if key in state})
+    policy = {key: state[key] for key in kept if key in state}
+    config = {key: value for key, value in state["config"].items() if key not in _PLACE}
+    if "overrides" in config:
+        config["overrides"] = [text for text in config["overrides"] if text.partition("=")[0] not in _PLACE]
+    save_checkpoint(Path(path), {**policy, "config": config})
     return Path(path)
