@@ -163,7 +163,9 @@ class TestResume:
             "overrides": ["seed=1", "output_dir=/here", "run_name=it"],
         }
         save_checkpoint(tmp_path / "run.pt", {key: value for key, value in run.items() if key != "format"})
-        config = load_checkpoint(export_policy(tmp_path / "run.pt", tmp_path / "policy.pt"))["config"]
+        policy = load_checkpoint(export_policy(tmp_path / "run.pt", tmp_path / "policy.pt"))
+        config = policy["config"]
+        assert policy["motion"] == run["motion"]  # but what it tracks
         assert config["overrides"] == ["seed=1"]
         assert set(run["config"]) - set(config) == {"output_dir", "run_name", "resume"}
 
