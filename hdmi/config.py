@@ -81,7 +81,7 @@ def plain_container(node: Any) -> dict[str, Any]:
 
 
 def run_container(cfg: DictConfig) -> dict[str, Any]:
-    """A run's config as plain values, interpolations resolved, but for `motion_root`.
+    """A run's config as plain values, interpolations resolved, but `motion_root` and the arguments as typed.
 
     `motion_root='${oc.env:HDMI_MOTIONS}'` stays so in what leaves the machine, and is looked up where it is used.
 
@@ -90,10 +90,8 @@ def run_container(cfg: DictConfig) -> dict[str, Any]:
         >>> run_container(cfg)
         {'seed': 1, 'device': 1, 'motion_root': '${oc.env:HOME}'}
     """
-    values = plain_container(cfg)
-    if "motion_root" in values:
-        values["motion_root"] = OmegaConf.to_container(cfg, resolve=False)["motion_root"]  # type: ignore[index, call-overload]
-    return values
+    typed: Any = OmegaConf.to_container(cfg, resolve=False)
+    return plain_container(cfg) | {key: typed[key] for key in ("motion_root", "overrides") if key in typed}
 
 
 def build_dataclass(cls: type, node: Any, where: str) -> Any:

@@ -591,13 +591,20 @@ def test_runs_that_differ_in_the_seed_are_one_curve(tmp_path: Path):
         run.mkdir()
         rows = [f"{i},{100 * (i + 1)},{i + seed},{error},\n" for i in range(2 + seed)]
         (run / "metrics.csv").write_text(header + "".join(rows))
-        overrides = ["task=walk", f"seed={seed}", f"run_name=seed{seed}", "video=false"]
+        overrides = [
+            "task=walk",
+            "motion_root=${oc.env:NOWHERE}",
+            f"seed={seed}",
+            f"run_name=seed{seed}",
+            "video=false",
+        ]
         OmegaConf.save(OmegaConf.create({"overrides": overrides}), run / "config.yaml")
     other = tmp_path / "other"
     other.mkdir()
     (other / "metrics.csv").write_text(header + "0,100,1,0.5,\n")
     runs = sorted(path for path in tmp_path.iterdir())
-    assert groups_of(runs) == {"other": [other], "task=walk": runs[1:]}
+    # by what was typed, whether it can be looked up here or not
+    assert groups_of(runs) == {"other": [other], "task=walk motion_root=${oc.env:NOWHERE}": runs[1:]}
     mean, band = over_seeds([read_metrics(run) for run in runs[1:]], "joint_error")
     assert mean.tolist() == pytest.approx([0.3, 0.3])
     assert band.tolist() == [[0.2, 0.2], [0.4, 0.4]]

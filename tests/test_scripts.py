@@ -12,6 +12,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from test_training import TINY
 
+from hdmi.commands.script import run_script
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -67,6 +69,16 @@ def test_sweep_runs_as_jobs(tmp_path: Path) -> None:
     called = OmegaConf.load(runs["no_rsi_seed3"] / "config.yaml").overrides
     assert {"+ablation=no_rsi", "seed=3", *TINY} <= set(called)
     assert len(list((tmp_path / "sweep" / ".submitit").glob("*/*_0_result.pkl"))) == 2
+
+
+def test_a_variable_that_a_config_names_and_nobody_set_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    cfg = OmegaConf.create({"motion_root": "${oc.env:NOWHERE}"})
+    assert run_script(lambda arguments, console: cfg.motion_root, [], None) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("ConfigError: ")
+    assert said.count("\n") == 1
+    assert "'NOWHERE' not found" in said
+    assert "motion_root" in said
 
 
 def test_slurm_launcher_is_submitit_s() -> None:

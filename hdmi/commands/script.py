@@ -55,6 +55,9 @@ def run_script(
     except caught as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 2
+    except OmegaConfBaseException as error:  # such as a variable of the environment that a config names
+        print(f"ConfigError: {composition_fault(error)}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130

@@ -11,6 +11,7 @@ import sys
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra import compose
@@ -86,7 +87,9 @@ def open_run(cfg: DictConfig) -> tuple[DictConfig, Path, list[str]]:
         CheckpointError: for a run that cannot be continued, or a new one in the folder of an old one.
         ConfigError: for options that do not fit the run to continue.
     """
-    typed = list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else None
+    typed: Any = None
+    if HydraConfig.initialized():
+        typed = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
     if cfg.resume is None:
         if typed is not None:
             with open_dict(cfg):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -67,7 +68,8 @@ def groups_of(runs: Sequence[Path]) -> dict[str, list[Path]]:
     found: dict[str, list[Path]] = {}
     for run, label in zip(runs, labels_of(runs), strict=True):
         file = (run.parent if run.is_file() else run) / CONFIG_FILE
-        overrides = OmegaConf.select(OmegaConf.load(file), "overrides") if file.is_file() else None
+        config: Any = OmegaConf.to_container(OmegaConf.load(file)) if file.is_file() else {}
+        overrides = config.get("overrides")
         own = label if overrides is None else " ".join(t for t in of_training(overrides) if not t.startswith("seed="))
         found.setdefault(own or "default", []).append(run)
     return found
