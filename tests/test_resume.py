@@ -53,13 +53,13 @@ def train(*arguments: str) -> None:
         command(cli.train, *arguments)
 
 
-def interrupted(iterations: int, *arguments: str) -> None:
-    """With a Ctrl-C in the middle of the last of these iterations."""
+def interrupted(iterations: int, *arguments: str, number: signal.Signals = signal.SIGINT) -> None:
+    """With a signal, a Ctrl-C, in the middle of the last of these iterations."""
     update = Trainer.update
 
     def stop(self: Trainer, batch: Any) -> dict[str, float]:
         if self.iteration == iterations - 1:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
         return update(self, batch)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -127,6 +127,11 @@ class TestContinuation:
         kept = OmegaConf.load(tmp_path / "stopped" / "config.yaml")
         assert kept.resume is None
         assert kept.seed == straight["config"]["seed"]
+
+    def test_a_termination_leaves_a_checkpoint_too(self, tmp_path: Path) -> None:
+        interrupted(1, *SHORT, f"output_dir={tmp_path}", "run_name=run", number=signal.SIGTERM)
+        assert load_checkpoint(tmp_path / "run")["iteration"] == 1
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
     def test_worlds_are_the_checkpoints_under_any_seed(self, run: Path) -> None:
         """Even where the seed is changed behind the command's back."""

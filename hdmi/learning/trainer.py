@@ -535,10 +535,12 @@ def make_trainer(cfg: DictConfig, folder: Path, evaluate: Evaluate | None = None
 
 @contextmanager
 def _deferred_interrupt(wanted: bool) -> Iterator[Callable[[], bool]]:
-    """Notes a first Ctrl-C, for the caller to ask for, and passes on a second one.
+    """Notes a first Ctrl-C or SIGTERM (a cluster takes its machine back), for the caller to ask for.
+
+    A second one is a KeyboardInterrupt.
 
     Args:
-        wanted: whether to do so; it is not done either where interrupts are handled otherwise.
+        wanted: whether to do so; it is not done either for signals that are handled otherwise.
     """
     came = False
 
@@ -549,15 +551,17 @@ def _deferred_interrupt(wanted: bool) -> Iterator[Callable[[], bool]]:
         came = True
         os.write(2, b"interrupted: ends after this iteration; once more ends it at once\n")  # print is not reentrant
 
-    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if not wanted or not usual or threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    signal.signal(signal.SIGINT, note)
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    held = {number: handler for number, handler in usual.items() if signal.getsignal(number) is handler}
+    if not wanted or threading.current_thread() is not threading.main_thread():
+        held = {}
+    for number in held:
+        signal.signal(number, note)
     try:
         yield lambda: came
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number, handler in held.items():
+            signal.signal(number, handler)
 
 
 class Objective(torch.nn.Module):
