@@ -249,9 +249,8 @@ class TestConfig:
         assert "algo.clip: 0.2 -> 0.1" in told
         assert len(told) == 4  # threads are as they were
         # later ones in place of earlier ones: the config can be composed again
-        replaced = ("total_frames=", "logger=", "num_threads=")
-        kept = [text for text in TINY if not text.startswith(replaced)]
-        assert cfg.overrides == [*kept, "+ablation=no_interaction_reward", *typed]
+        kept = [text for text in TINY if not text.startswith(("total_frames=", "logger="))]
+        assert cfg.overrides == [*kept, "+ablation=no_interaction_reward", *typed[:-1]]
         assert problem_changes(load_checkpoint(folder)["config"], OmegaConf.to_container(cfg)) == []
 
     def test_seed_and_place_stay(self, held: Callable[..., Path], tmp_path: Path) -> None:
@@ -346,6 +345,47 @@ class TestConfig:
         old, new = (OmegaConf.to_container(config(*overrides), resolve=True) for overrides in ([], [override]))
         assert old != new
         assert problem_changes(old, new) == []
+
+    @pytest.mark.parametrize(
+        ("own", "typed", "node", "value"),
+        [
+            (["+lever=springs"], "assist.root.frequency=1", "assist.root.frequency", 1),
+            (["task=walk"], "termination.root_pose.min_steps=9", "termination.root_pose.min_steps", 9),
+            (["task=no_such_task"], "algo.clip=0.1", "algo.clip", 0.1),  # removed or renamed since
+        ],
+    )
+    def test_nodes_that_only_the_run_has_may_be_typed(
+        self,
+        own: list[str],
+        typed: str,
+        node: str,
+        value: float,
+        held: Callable[..., Path],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        there = [] if own == ["task=no_such_task"] else own
+        folder = held(lambda values: values.update(overrides=[*TINY, *own]), *there)
+        opened = []
+        monkeypatch.setattr(cli, "train", lambda cfg: opened.append(cli.open_run(cfg)))
+        monkeypatch.setattr(sys, "argv", ["train.py", f"resume={folder}", typed])
+        cli.main()
+        [(cfg, _, notes)] = opened
+        assert OmegaConf.select(cfg, node) == value
+        assert cfg.overrides == [*TINY, *own, typed]
+        assert len(notes) == 2
+
+    def test_what_neither_has_is_one_line(
+        self, held: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        folder = held(lambda values: None, "+lever=springs")
+        monkeypatch.setattr(sys, "argv", ["train.py", f"resume={folder}", "assist.root.frequenzy=7"])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        assert end.value.code == 2
+        told = capsys.readouterr().err.strip()
+        assert told.startswith("ConfigError")
+        assert "assist" in told
+        assert len(told.splitlines()) == 1
 
     def test_what_does_not_fit_the_run_is_one_line(
         self, held: Callable[..., Path], capsys: pytest.CaptureFixture[str]

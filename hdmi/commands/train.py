@@ -16,6 +16,7 @@ from typing import Any
 import hydra
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from rich.console import Console
 from rich.markup import escape
@@ -30,7 +31,7 @@ from hdmi.evaluation.protocol import training_figures
 from hdmi.learning import make_trainer
 from hdmi.learning.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from hdmi.learning.logger import RunLogger
-from hdmi.learning.resume import KEPT, continued_config, differences, find_run
+from hdmi.learning.resume import KEPT, continued_config, differences, find_run, with_own_arguments
 
 
 def train(cfg: DictConfig) -> None:
@@ -99,6 +100,7 @@ def open_run(cfg: DictConfig) -> tuple[DictConfig, Path, list[str]]:
     state = load_checkpoint(checkpoint)
     call = {"resume": str(checkpoint), "resume_anyway": cfg.resume_anyway}
     if typed is not None:  # else the config is what the caller made of it
+        typed = [text for text in typed if text not in (state["config"].get("overrides") or ())]
         given = cfg
         cfg = continued_config(state["config"], typed, partial(compose, HydraConfig.get().job.config_name))
     with open_dict(cfg):
@@ -152,6 +154,19 @@ def _composed(cfg: DictConfig) -> None:
     train(cfg)
 
 
+def _composed_for_the_run() -> None:
+    """As `_composed`; to continue a run, nodes may be typed that only its own task, levers and groups have."""
+    typed = sys.argv[1:]
+    sys.argv[1:] = with_own_arguments(typed)
+    try:
+        _composed()
+    except ConfigCompositionException:
+        if sys.argv[1:] == typed:
+            raise
+        sys.argv[1:] = typed  # configs have changed since the run was made
+        _composed()
+
+
 def main() -> None:
     """Trains under the config that the command line composes."""
-    run_composed(_composed)
+    run_composed(_composed_for_the_run)

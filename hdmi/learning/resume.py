@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hdmi.config import ConfigError, run_container
-from hdmi.learning.checkpoint import POLICY_FILE, CheckpointError, checkpoints, find_checkpoint
+from hdmi.learning.checkpoint import POLICY_FILE, CheckpointError, checkpoints, find_checkpoint, load_checkpoint
 
 CONFIG_FILE = "config.yaml"
 # Of the call, not of the run.
@@ -83,6 +83,26 @@ def find_run(path: str | Path) -> tuple[Path, Path]:
             f"beside {CONFIG_FILE}"
         )
     return folder, checkpoint
+
+
+def with_own_arguments(arguments: Sequence[str]) -> list[str]:
+    """A command line that continues a run, with what the run was made with before what is typed.
+
+    Hydra composes a config before anything of a run is known, and refuses nodes that the default task does not have.
+    Where nothing is continued, or it cannot be found, the command line is as it was.
+    """
+    options = [text for text in arguments if text.startswith("-")]
+    parser = OverridesParser.create()
+    try:
+        typed = parser.parse_overrides([text for text in arguments if text not in options])
+        resume = [override.value() for override in typed if override.key_or_group == "resume"]
+        if not resume or not isinstance(resume[-1], str):
+            return list(arguments)
+        own = load_checkpoint(find_run(resume[-1])[1])["config"].get("overrides")
+        before = parser.parse_overrides(list(own or ()))
+    except (CheckpointError, HydraException):
+        return list(arguments)
+    return options + _merged(before, typed)
 
 
 def continued_config(
