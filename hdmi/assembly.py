@@ -225,8 +225,8 @@ def make_env(
     settings = {"envs_per_thread": cfg.get("envs_per_thread"), **cfg.get("starts", {})}
     env = (MaskedResetEnv if base.backend.masked else RowResetEnv)(base, stack, **settings)
     # raw keys are dropped, but for what steps read back and what learners and logs want
-    state = set(env.full_state_spec.keys(True, True))
     entries = list(env.full_observation_spec.keys(True, True))
+    state = set(env.full_state_spec.keys(True, True))
     wanted = [key for key in entries if key in state or _top(key) in OUTPUTS]
     env.append_transform(Keep([*wanted, *env.reward_keys, *env.done_keys]))
     return env
@@ -234,15 +234,14 @@ def make_env(
 
 def network_inputs(env: TransformedEnv) -> dict[str, dict[str, int]]:
     """What networks are given by an environment: output of each `Concatenate` -> term -> width, in order."""
-    found = {}
-    for transform in env.transform:
-        if isinstance(transform, Concatenate):
-            spec = transform.parent.full_observation_spec
-            terms = {
-                "/".join((key,) if isinstance(key, str) else key): spec[key].shape[-1] for key in transform.in_keys
-            }
-            found[str(transform.out_keys[0])] = terms
-    return found
+    assert env.observation_spec is not None  # transforms know widths once specs have been asked for
+    concatenations = [transform for transform in env.transform if isinstance(transform, Concatenate)]
+    return {
+        str(transform.out_keys[0]): {
+            "/".join((key,) if isinstance(key, str) else key): width for key, width in transform.widths.items()
+        }
+        for transform in concatenations
+    }
 
 
 def _top(key: Any) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from tensordict import NestedKey
+from torchrl.data import Composite
 from torchrl.envs import CatTensors
 
 
@@ -17,6 +18,9 @@ class Concatenate(CatTensors):
         groups: entries of the stack that stand before.
         out_key: of the vector.
         written: entry of the stack -> keys that its transforms write.
+
+    Attributes:
+        widths: of the entries, once an environment has been asked for its specs.
 
     Raises:
         ValueError: for a group that does not stand before, or an entry that they write twice.
@@ -35,3 +39,9 @@ class Concatenate(CatTensors):
         if twice := sorted({str(key) for key in keys if keys.count(key) > 1}):
             raise ValueError(f"groups: {', '.join(twice)} written by more than one transform")
         super().__init__(in_keys=keys, out_key=out_key, dim=-1, del_keys=False, sort=False)
+        self.widths: dict[NestedKey, int] = {}
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        observation_spec = super().transform_observation_spec(observation_spec)
+        self.widths = {key: observation_spec[key].shape[-1] for key in self.in_keys}
+        return observation_spec
