@@ -172,7 +172,6 @@ CHANGED_BY_LEVER: dict[str, tuple[set[str], set[str], set[str]]] = {
     "root_history": ({"noise.root_reference", "history.root_reference"}, set(), set()),
     "springs": ({"assist.root"}, set(), set()),
     "springs_object": ({"assist.object"}, set(), set()),
-    "strict_root": ({"early_end.early_root_pose"}, set(), set()),
 }
 ON_BY_DEFAULT = ("early_end", "feedforward", "noise_curriculum")
 
@@ -201,11 +200,14 @@ class TestLevers:
         assert close.reset.state.noise.joint_pos < default.reset.state.noise.joint_pos
         assert {key for key in close if close[key] != default[key]} == {"reset"}
 
-    def test_strict_root_allows_half_of_what_early_end_allows(self):
-        usual, strict = (load_config("task=walk", *lever).early_end for lever in ((), ("+lever=strict_root",)))
-        assert strict.early_root_pose.thresholds == [usual.early_root_pose.thresholds[0] / 2, 0.8]
-        strict.early_root_pose.thresholds = usual.early_root_pose.thresholds
-        assert strict == usual
+    def test_early_ends_come_before_the_paper_s(self):
+        cfg = load_config("task=walk")
+        assert cfg.early_end.early_root_pose.thresholds[0] == cfg.termination.root_pose.thresholds[0] / 2
+        for early, paper in (("early_root_pose", "root_pose"), ("early_body_pose", "body_local_pose")):
+            ends, usual = cfg.early_end[early], cfg.termination[paper]
+            assert ends.errors == usual.errors
+            assert all(a <= b for a, b in zip(ends.thresholds, usual.thresholds, strict=True))
+            assert ends.min_steps < usual.min_steps
 
     def test_the_paper_s_method_is_without_those_that_are_on(self):
         ours, paper = load_config("task=walk"), load_config("task=walk", *PAPER, f"+lever=[{','.join(ON_BY_DEFAULT)}]")
