@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import math
 import tempfile
@@ -20,14 +21,16 @@ from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration
 
 from hdmi.assembly import Task, make_env, make_task, scene_parts
 from hdmi.config import ConfigError, task_config
-from hdmi.evaluation.agents import blind_agent
-from hdmi.evaluation.protocol import EvalResult, evaluate_policy
+from hdmi.evaluation.agents import BlindAgent, blind_agent
+from hdmi.evaluation.protocol import EvalResult, evaluate_policy, evaluation_config, make_evaluation_env
 from hdmi.learning import make_trainer
 from hdmi.motion import find_motion, load_motion, make_playback
 from hdmi.threads import set_threads
 
 _SPEC_ENVS, _EPISODES = 2, 16
 _RETURN_ENVS, _RETURN_STEPS = 384, 96  # episodes before and after a training, and control steps of each
+_HOLD_TIME, _HOLD_STARTS = 0.5, 8  # s; frames to start from
+_HELD = 0.5  # of the contacts, which a reference that can be learned keeps without a policy
 _CHANCE = 0.01  # p-value below which a training counts as an improvement
 
 
@@ -80,6 +83,34 @@ def measure_contacts(cfg: DictConfig) -> list[Contact]:
     return contacts
 
 
+def measure_hold(cfg: DictConfig, task: Task) -> np.ndarray:
+    """Share of the intended contacts that last without a policy, over half a second from frames all over the contact.
+
+    Servos follow the reference, with the torques that it asks for where the config feeds them forward, under the task's
+    randomization, from the reference's own states. Where what is held slips or tips out of the hands at once, no policy
+    finds out how to hold it.
+
+    Returns:
+        For each start, in order of time. [S], none if no contact is labelled for so long
+    """
+    cfg = copy.deepcopy(cfg)
+    cfg.reset.state.noise = None
+    label = task.reference.contact.cpu().numpy()  # [T, E]
+    steps = round(_HOLD_TIME / task.scene.sim.control_dt)
+    lasting = [t for t in range(len(label) - steps) if label[t].any() and (label[t : t + steps + 1] == label[t]).all()]
+    shares = []
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(cfg.seed)
+        for at in np.linspace(0, len(lasting) - 1, _HOLD_STARTS if lasting else 0).round().astype(int):
+            env = make_evaluation_env(evaluation_config(cfg, start=lasting[at]), task, _EPISODES)
+            env.set_seed(cfg.seed)
+            agent = BlindAgent("zero", env.action_spec.shape[-1])
+            metrics = env.rollout(steps, agent, break_when_any_done=False)["next", "metrics"]
+            shares.append(float(metrics["contact_made"].sum() / metrics["contact_intended"].sum()))
+            env.close()
+    return np.array(shares)
+
+
 @dataclass(frozen=True)
 class Training:
     """What a short training changed: returns of the untrained and of the trained policy, in the same episodes.
@@ -123,6 +154,7 @@ class TaskCheck:
 
     name: str
     contacts: list[Contact] = field(default_factory=list)
+    hold: np.ndarray = field(default_factory=lambda: np.zeros(0))  # see `measure_hold`
     zero: EvalResult | None = None  # servos that follow the reference
     training: Training | None = None
     seconds: float = 0.0
@@ -142,7 +174,8 @@ def check_task(
     1. The environment builds and passes TorchRL's spec check.
     2. The reference, replayed without physics, meets the object where its labels say: end effectors are on average as
        close to their contact points as the lost-contact termination asks for.
-    3. Servos that follow the reference give finite survival and errors.
+    3. Servos that follow the reference give finite survival and errors, and keep hold of an object that is free to
+       fall: half of the contacts last for half a second, from starts in the middle of them.
     4. A training of `frames` control steps improves the return that PPO maximizes, that of the policy with its
        exploration noise: both policies play the first steps of the same episodes (start frames, perturbations and
        randomization drawn alike), and a signed-rank test finds the trained one better. If it does not, another
@@ -175,6 +208,12 @@ def check_task(
                 f"{contact.effector}: on average {mean:.2f} m from its contact point where labels say that it touches, "
                 f"and lost_contact allows {limit:g} m"
             )
+    check.hold = measure_hold(cfg, task)
+    if task.scene.object_free_dof is not None and len(check.hold) and not check.hold.mean() >= _HELD:
+        check.problems.append(
+            f"reference: without a policy {check.hold.mean():.0%} of the contacts last {_HOLD_TIME:g} s from starts in "
+            f"the middle of them, expected {_HELD:.0%}: see where hands touch the object, and whether it slips or tips"
+        )
     check.zero = evaluate_policy(blind_agent("zero", cfg, task), cfg, _EPISODES, task)
     bad = [key for key, value in check.zero.figures().items() if not math.isfinite(value["mean"])]
     if bad or not check.zero.figures():
@@ -221,8 +260,8 @@ def check_table(checks: Sequence[TaskCheck]) -> Table:
     """The figures of several checks, a row for each task."""
     title = f"Tasks: {sum(not check.problems for check in checks)} of {len(checks)} pass"
     table = Table(title=title, title_justify="left")
-    columns = ("task", "contact distance m", "surface gap m", "no policy: survives", "joints rad", "bodies m", "object")
-    for column in (*columns, "return", "s", "problems"):
+    columns = ("task", "contact distance m", "surface gap m", "no policy: holds", "survives", "joints rad", "bodies m")
+    for column in (*columns, "object", "return", "s", "problems"):
         table.add_column(column, overflow="fold")
     for check in checks:
         distance = " ".join(f"{c.distance.mean():.3f}" if len(c.distance) else "-" for c in check.contacts)
@@ -239,8 +278,9 @@ def check_table(checks: Sequence[TaskCheck]) -> Table:
             mean, middle = learned.gain
             gain = f"{mean:+.2f} of {learned.before.mean():.2f}, median {middle:+.2f}, p {learned.chance:.0e}"
         table.add_row(
-            check.name, distance, gap, shown("survival"), shown("joint_error"), shown("body_error"), object_error,
-            gain, f"{check.seconds:.0f}", "\n".join(check.problems) or "none",
+            check.name, distance, gap, f"{check.hold.mean():.2f}" if len(check.hold) else "", shown("survival"),
+            shown("joint_error"), shown("body_error"), object_error, gain, f"{check.seconds:.0f}",
+            "\n".join(check.problems) or "none",
         )  # fmt: skip
     return table
 
