@@ -439,7 +439,7 @@ def test_early_ends_and_the_tasks_starts_are_conditions_of_their_own():
     assert set(termination_names(evaluation_config(plain))) == {"root_pose", "body_local_pose"}
     strict = evaluation_config(plain, early_end=True)
     assert set(termination_names(strict)) == {"root_pose", "body_local_pose", "early_root_pose", "early_body_pose"}
-    assert list(strict.termination.early_root_pose.thresholds) == [0.5, 0.8]
+    assert list(strict.termination.early_root_pose.thresholds) == [0.25, 0.8]
     assert list(task_starts_config(close).reset.state.noise.root_pos) == [0.2, 0.2, 0.01]
     with pytest.raises(ConfigError, match="trained without early ends"):
         evaluation_config(task_config("lift_box"), early_end=True)
