@@ -234,7 +234,7 @@ def make_env(
 
 def network_inputs(env: TransformedEnv) -> dict[str, dict[str, int]]:
     """What networks are given by an environment: output of each `Concatenate` -> term -> width, in order."""
-    assert env.observation_spec is not None  # transforms know widths once specs have been asked for
+    _ = env.full_observation_spec  # asked for, transforms know widths
     concatenations = [transform for transform in env.transform if isinstance(transform, Concatenate)]
     return {
         str(transform.out_keys[0]): {

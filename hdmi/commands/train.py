@@ -100,7 +100,6 @@ def open_run(cfg: DictConfig) -> tuple[DictConfig, Path, list[str]]:
     state = load_checkpoint(checkpoint)
     call = {"resume": str(checkpoint), "resume_anyway": cfg.resume_anyway}
     if typed is not None:  # else the config is what the caller made of it
-        typed = [text for text in typed if text not in (state["config"].get("overrides") or ())]
         given = cfg
         cfg = continued_config(state["config"], typed, partial(compose, HydraConfig.get().job.config_name))
     with open_dict(cfg):
