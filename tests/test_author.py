@@ -346,9 +346,18 @@ class TestMotions:
         made = author_motion(plan(**content, hands={"left": [here]}), BOX, (), FINGERTIPS).motion
         np.testing.assert_allclose(made.contact_points, [[(0.02, 0.14, -0.02), FINGERTIPS[1].target]] * 5, atol=1e-6)
         np.testing.assert_array_equal(made.object_contact, [[True, False]] * 5)
+
+    def test_each_contact_has_a_point_where_the_plan_says(self):
+        here = {"at": 0, "frame": "object", "pos": [0.02, 0.14, -0.02], "contact": "here"}
+        content = {"duration": 0.1, "corrections": 0, "object": {"path": [{"at": 0, "pos": [0.35, 0, 0.9]}]}}
         elsewhere = {**here, "at": 0.05, "pos": [0, 0.14, 0]}
-        with pytest.raises(PlanError, match="left_wrist_yaw_link: one contact point 'here', got"):
-            author_motion(plan(**content, hands={"left": [here, elsewhere]}), BOX, (), FINGERTIPS)
+        with pytest.raises(PlanError, match=r"left\[1\].pos: a contact 'here' has one point, \(0.02, 0.14"):
+            plan(**content, hands={"left": [here, elsewhere]})
+        between = {"at": 0.02, "gap": 0.01, "contact": False}
+        made = author_motion(plan(**content, hands={"left": [here, between, elsewhere]}), BOX, (), FINGERTIPS).motion
+        # of the contacts at 0 and at 0.05 s the nearest one's
+        expected = [(0.02, 0.14, -0.02)] * 2 + [(0, 0.14, 0)] * 3
+        np.testing.assert_allclose(made.contact_points[:, 0], expected, atol=1e-6)
 
     def test_lift_box_is_what_its_plan_makes(self):
         parts = scene_parts(load_config())

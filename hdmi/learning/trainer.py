@@ -151,7 +151,7 @@ class Trainer:
         self.actor_optim = torch.optim.Adam(self.actor.parameters(), lr=algo.actor_lr, fused=True)
         self.critic_optim = torch.optim.Adam(self.critic.parameters(), lr=algo.critic_lr, fused=True)
         self.schedule = KLAdaptiveLR(
-            self.actor_optim, target_kl=algo.desired_kl, factor=1.2, min_lr=1e-5, max_lr=algo.max_lr
+            self.actor_optim, target_kl=algo.desired_kl, factor=1.2, min_lr=algo.min_lr, max_lr=algo.max_lr
         )
         self.frames_per_batch = cfg.num_envs * algo.frames_per_env  # of this rank
         self.iteration = self.frames = 0

@@ -386,6 +386,8 @@ def _pose_keys(nodes: Sequence[_Node]) -> tuple[PoseKey, ...]:
             )
             if key.here and (key.frame != "object" or key.pos is None):
                 raise PlanError(f"{node.at('contact')}: 'here' is a `pos` in the frame 'object'")
+            if key.here and before.here and key.pos != before.pos:
+                raise PlanError(f"{node.at('pos')}: a contact 'here' has one point, {before.pos}, got {key.pos}")
         keys.append(replace(key, time=node.time("at"), where=node.where))
         _after(keys, node)
     return tuple(keys)

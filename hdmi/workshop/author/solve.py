@@ -126,7 +126,7 @@ def author_motion(
         options=replace(options, self_collision=0.005, tolerance=_TOLERANCE),
         on_frame=None if on_frame is None else lambda t: on_frame(t, len(time)),
     )
-    points = _contact_points(plan, paths, effectors, hands)
+    points = _contact_points(plan, paths, effectors, hands, time)
     motion = _motion(plan, result, paths, object, scenery, contact, points)
     return _report(plan, result, motion, load, paths, time)
 
@@ -351,15 +351,16 @@ def _com(paths: _Paths, load: Load, time: np.ndarray) -> np.ndarray:
     return np.column_stack([over, np.zeros(len(time))])
 
 
-def _contact_points(plan: Plan, paths: _Paths, effectors: Sequence[Effector], hands: Sequence[ik.Target]) -> np.ndarray:
-    """The task's targets, or where keys say `contact: here`; on an object that rolls, where the hands touch it, which
-    moves over it. [T, E, 3]"""
-    points = np.empty((len(paths.pressure), len(effectors), 3))
+def _contact_points(
+    plan: Plan, paths: _Paths, effectors: Sequence[Effector], hands: Sequence[ik.Target], time: np.ndarray
+) -> np.ndarray:
+    """The task's targets, or where keys say `contact: here`, of the one that is nearest in time; on an object that
+    rolls, where the hands touch it, which moves over it. [T, E, 3]"""
+    points = np.empty((len(time), len(effectors), 3))
     for e, effector in enumerate(effectors):
-        here = list(dict.fromkeys(key.pos for key in _keys_of(plan, effector.body) if key.here))
-        if len(here) > 1:
-            raise PlanError(f"{plan.file}: {effector.body}: one contact point 'here', got {here}")
-        points[:, e] = here[0] if here else effector.target
+        here = [key for key in _keys_of(plan, effector.body) if key.here]
+        nearest = np.abs(np.subtract.outer(time, [key.time for key in here])).argmin(axis=1) if here else None
+        points[:, e] = effector.target if nearest is None else np.array([key.pos for key in here])[nearest]
         hand = next((h for h in hands if isinstance(h, ik.PointTarget) and h.body == effector.body), None)
         if plan.rolls is not None and paths.object is not None and hand is not None:
             inward = paths.object.rot.inv().apply(np.asarray(hand.pos) - paths.object.pos)
