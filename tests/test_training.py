@@ -23,10 +23,11 @@ from torchrl.objectives.value import GAE
 
 from hdmi.commands.train import open_run, run_folder
 from hdmi.learning import CheckpointError, RunningNorm, Trainer, load_checkpoint, load_policy, save_checkpoint
-from hdmi.learning.checkpoint import FORMAT, checkpoints, claim
+from hdmi.learning.checkpoint import BEST_FILE, FORMAT, checkpoints, claim
 from hdmi.learning.networks import bound_noise, make_actor, network_of, normalised_actor, normalised_critic
 from hdmi.learning.policy import export_policy, make_networks
-from hdmi.learning.trainer import DivergenceError
+from hdmi.learning.resume import find_run
+from hdmi.learning.trainer import DivergenceError, Evaluate
 from hdmi.metrics import read_rows
 
 ROOT = Path(__file__).parents[1]
@@ -133,6 +134,28 @@ class TestRun:
         trainer.run()
         assert evaluated == [trainer.averaged.module]
         assert [row["eval/success_rate"] for row in read_rows(tmp_path / "metrics.csv")[1]][-1] == "0.5"
+
+    def test_the_best_of_the_evaluations_is_kept(self, tmp_path: Path) -> None:
+        figures = [(0.5, 0.6), (0.7, 0.8), (0.7, 0.8), (0.7, 0.7)]
+
+        def evaluations(rows: list[tuple[float, float]]) -> Evaluate:
+            left = iter(rows)
+            return lambda *_: dict(zip(("eval/success_rate", "eval/survival"), next(left), strict=True))
+
+        Trainer(config("eval_interval=1"), tmp_path, evaluations(figures)).run()
+        best = load_checkpoint(tmp_path / "checkpoints" / BEST_FILE)
+        assert best["iteration"] == 3  # of equals the one that has trained longer
+        assert load_policy(tmp_path)[2]["iteration"] == 4  # a run is still its newest policy
+        resume = (f"resume={tmp_path}", "eval_interval=1")
+        Trainer(config(*resume, "total_frames=160"), tmp_path, evaluations([(0.6, 0.9)])).run()
+        assert load_checkpoint(tmp_path / "checkpoints" / BEST_FILE)["iteration"] == 3
+        Trainer(config(*resume, "total_frames=192"), tmp_path, evaluations([(0.8, 0.8)])).run()
+        assert load_checkpoint(tmp_path / "checkpoints" / BEST_FILE)["iteration"] == 6
+        (tmp_path / "checkpoints" / "checkpoint_000006.pt").unlink()  # one of an iteration that is trained again
+        Trainer(config(*resume, "total_frames=192"), tmp_path, evaluations([(0.1, 0.1)])).run()
+        assert load_checkpoint(tmp_path / "checkpoints" / BEST_FILE)["merit"] == [0.1, 0.1]
+        with pytest.raises(CheckpointError, match=r"best\.pt holds networks, but no worlds to continue"):
+            find_run(tmp_path / "checkpoints" / BEST_FILE)
 
 
 class TestResume:

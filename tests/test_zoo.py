@@ -88,12 +88,12 @@ class Commands:
             place = options.get("resume") or f"{options['output_dir']}/{options['run_name']}"
             self.train(Path(place), [text for text in arguments if not text.startswith("resume=")], num_envs=8)
         elif verb == "evaluate":
-            run = Path(options["checkpoint"])
-            result = evaluation(self.success[run.name], num_envs=int(options["num_envs"]))
-            result.save(run / "eval.json")
+            policy = Path(options["checkpoint"])
+            result = evaluation(self.success[policy.name], num_envs=int(options["num_envs"]))
+            result.save(options.get("out", policy / "eval.json"))
         elif verb == "export":
-            run = Path(options["checkpoint"])
-            evaluation(self.success[run.name]).save(Path(options["out"]) / "eval.json")
+            policy = Path(options["checkpoint"])
+            evaluation(self.success[policy.name]).save(Path(options["out"]) / "eval.json")
         return subprocess.CompletedProcess(command, self.status)
 
     def train(self, run: Path, overrides: list[str], frames: int = 100, num_envs: int = 256) -> None:
@@ -147,6 +147,18 @@ def test_only_what_is_better_is_taken_over(run: Callable[..., list[Outcome]], tm
     assert outcomes["lift"].kept
     assert commands.verbs("walk") == ["train", "evaluate"]
     assert EvalResult.load(tmp_path / "zoo" / "walk" / "eval.json")["success_rate"]["mean"] == 0.92
+
+
+@pytest.mark.parametrize(("best", "expected"), [(0.95, 0.95), (0.85, 0.9)])
+def test_the_best_on_the_way_may_be_better_than_the_last(
+    run: Callable[..., list[Outcome]], tmp_path: Path, best: float, expected: float
+):
+    commands = Commands({"walk": 0.9, "lift": 1.0, "best.pt": best})
+    commands.train(tmp_path / "runs" / "walk", RECIPES["walk"])
+    save_checkpoint(tmp_path / "runs" / "walk" / "checkpoints" / "best.pt", {"iteration": 60})
+    outcomes = {outcome.name: outcome for outcome in run(commands)}
+    assert str(outcomes["walk"]) == f"walk: success {100 * expected:.1f} %: taken over"
+    assert EvalResult.load(tmp_path / "zoo" / "walk" / "eval.json")["success_rate"]["mean"] == expected
 
 
 def test_a_policy_for_another_motion_gives_way(run: Callable[..., list[Outcome]], tmp_path: Path):

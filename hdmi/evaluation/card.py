@@ -10,10 +10,17 @@ from omegaconf import OmegaConf
 
 from hdmi.deploy.format import GRAPH_FILE, NETWORK_FILE, SCENE_FILE, SPEC_FILE
 from hdmi.evaluation.curves import plot_runs
-from hdmi.evaluation.protocol import EVAL_FILE, EvalResult, evaluate_conditions, evaluation_file, unit_of
+from hdmi.evaluation.protocol import (
+    EVAL_FILE,
+    EvalResult,
+    evaluate_conditions,
+    evaluation_file,
+    run_folder_of,
+    unit_of,
+)
 from hdmi.evaluation.video import render_checkpoint
 from hdmi.learning import export_policy, load_checkpoint
-from hdmi.learning.checkpoint import POLICY_FILE
+from hdmi.learning.checkpoint import POLICY_FILE, find_checkpoint
 from hdmi.metrics import METRICS_FILE, read_rows
 
 _CARD_FILE = "README.md"
@@ -50,7 +57,7 @@ def export(run_or_checkpoint: str | Path, folder: str | Path, num_envs: int = 25
         file.unlink()
     results = evaluate_conditions(policy, num_envs, seed, folder=folder)
     render_checkpoint(policy, seed=seed)
-    curve = _plot_curve(Path(run_or_checkpoint), folder / _CURVE_FILE)
+    curve = _plot_curve(run_folder_of(find_checkpoint(run_or_checkpoint)), folder / _CURVE_FILE)
     (folder / _CARD_FILE).write_text(_card(state, results, folder, seed, curve), encoding="utf-8")
     return folder
 

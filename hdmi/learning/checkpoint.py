@@ -18,6 +18,7 @@ _SINCE = {
     "observation.policy, input.critic, noise, history and input.policy",
 }
 POLICY_FILE = "policy.pt"  # of an exported policy
+BEST_FILE = "best.pt"  # beside a run's checkpoints: the one whose policy evaluated best
 
 
 class CheckpointError(RuntimeError):
@@ -84,18 +85,31 @@ def checkpoints(folder: Path) -> list[Path]:
     return sorted(folder.glob("checkpoint_*.pt"), key=lambda path: (len(path.name), path.name))
 
 
+def best_checkpoint(folder: Path) -> Path | None:
+    """The checkpoint of a run's folder `checkpoints` whose policy evaluated best on the way, if there is one."""
+    path = folder / BEST_FILE
+    return path if path.is_file() else None
+
+
 def supersede(folder: Path, iteration: int) -> list[Path]:
     """Moves the checkpoints after an iteration into `superseded`: the run goes on from that one, they would be newer.
 
     Returns:
         Where they are now.
     """
-    moved = []
-    for path in checkpoints(folder):
-        if path.stem.removeprefix("checkpoint_").isdecimal() and int(path.stem.removeprefix("checkpoint_")) > iteration:
-            (folder / "superseded").mkdir(exist_ok=True)
-            moved.append(path.replace(folder / "superseded" / path.name))
-    return moved
+    later = [path for path in checkpoints(folder) if _iteration(path) > iteration]
+    best = best_checkpoint(folder)
+    if best is not None and load_checkpoint(best)["iteration"] > iteration:
+        later.append(best)
+    for path in later:
+        (folder / "superseded").mkdir(exist_ok=True)
+        path.replace(folder / "superseded" / path.name)
+    return [folder / "superseded" / path.name for path in later]
+
+
+def _iteration(path: Path) -> int:
+    number = path.stem.removeprefix("checkpoint_")
+    return int(number) if number.isdecimal() else -1
 
 
 def find_checkpoint(path: str | Path) -> Path:

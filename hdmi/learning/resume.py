@@ -15,7 +15,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hdmi.config import ConfigError, run_container
-from hdmi.learning.checkpoint import POLICY_FILE, CheckpointError, checkpoints, find_checkpoint, load_checkpoint
+from hdmi.learning.checkpoint import (
+    BEST_FILE,
+    POLICY_FILE,
+    CheckpointError,
+    checkpoints,
+    find_checkpoint,
+    load_checkpoint,
+)
 
 CONFIG_FILE = "config.yaml"
 # Of the call, not of the run.
@@ -73,6 +80,11 @@ def find_run(path: str | Path) -> tuple[Path, Path]:
             f"resume: {checkpoint} is an exported policy, without critic and optimizers; it cannot be continued"
         )
     folder = checkpoint.parent.parent
+    if checkpoint.name == BEST_FILE:
+        raise CheckpointError(
+            f"resume: {checkpoint} holds networks, but no worlds to continue; resume={folder} goes on from the newest "
+            "checkpoint, warm_start= begins a run from these networks"
+        )
     if (
         checkpoint.parent.name != "checkpoints"
         or not (folder / CONFIG_FILE).is_file()

@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -31,7 +31,16 @@ from torchrl.objectives.value import GAE
 from hdmi.assembly import Task, make_task, network_inputs
 from hdmi.config import ConfigError, build, one_line, run_container
 from hdmi.console import make_console
-from hdmi.learning.checkpoint import CheckpointError, claim, load_checkpoint, rotate, save_checkpoint, supersede
+from hdmi.learning.checkpoint import (
+    BEST_FILE,
+    CheckpointError,
+    best_checkpoint,
+    claim,
+    load_checkpoint,
+    rotate,
+    save_checkpoint,
+    supersede,
+)
 from hdmi.learning.distributed import Ranks
 from hdmi.learning.logger import RunLogger
 from hdmi.learning.networks import bound_noise, network_of, normalised_actor, normalised_critic
@@ -50,6 +59,7 @@ _FIGURES = {  # name in the log -> of the losses
     "clip_fraction": "clip_fraction",
     "imitation": "imitation",
 }
+_MERIT = ("eval/success_rate", "eval/survival")  # what makes the best of a run's evaluations
 _COLLECTED_KEYS = ("action", "action_log_prob", ("next", "reward"), ("next", "done"), ("next", "terminated"))
 
 
@@ -68,7 +78,8 @@ class Trainer:
     moments for the next collection. The actor's learning rate follows the policy's KL divergence, which is to fall
     from `desired_kl` to `final_kl` over `total_frames`, so that the policy settles. What is evaluated and leaves the
     training is the mean of the actor's weights over the last iterations (`average` of those so far), which is steadier
-    than any of them.
+    than any of them. Where there are evaluations on the way (`cfg.eval_interval`), the policy that came out best is
+    kept, too, in `checkpoints/best.pt`.
 
     Where the environment has `reward_groups`, the critic has a head for each group, trained on that group's returns,
     and the policy ascends the sum of the groups' advantages. The sum is taken before advantages are normalised, so that
@@ -158,6 +169,7 @@ class Trainer:
         self.bad_updates = self.lost_checkpoints = 0
         self.taken: list[Taken] = []  # by a warm start
         self.elapsed = 0.0  # s of collection and learning
+        self.best: list[float] = []  # success and survival of the best evaluation on the way
         self._warm_up()
         self.inputs = network_inputs(self.env)
         if state is None and cfg.warm_start is not None:
@@ -363,6 +375,8 @@ class Trainer:
             OmegaConf.save(self._config_of_run(), self.folder / CONFIG_FILE)
             for path in supersede(self.folder / "checkpoints", self.iteration):
                 print(f"set aside, the run goes on from iteration {self.iteration}: {path}")
+            best = best_checkpoint(self.folder / "checkpoints")
+            self.best = [] if best is None else load_checkpoint(best)["merit"]
         columns = (
             TextColumn("[bold]{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
             TextColumn("{task.fields[numbers]}"),
@@ -407,6 +421,8 @@ class Trainer:
                     progress.update(bar, completed=self.iteration, numbers=_headline(row))
                     if first and not visible and (self.iteration % 10 == 0 or self.frames >= cfg.total_frames):
                         console.print(f"{self.iteration}/{total} {_headline(row)}", highlight=False)
+                    if first:
+                        self._keep_best(row)
                     if self.iteration % cfg.checkpoint_interval == 0:
                         self.save()
                     if interrupted():
@@ -437,7 +453,23 @@ class Trainer:
         ranks = self.ranks.gather({"rng": torch.get_rng_state(), **self.collector.state_dict()})
         if not self.ranks.is_first:
             return
-        state = {
+        folder = self.folder / "checkpoints"
+        if self._write(folder / f"checkpoint_{self.iteration:06d}.pt", self._state() | {"ranks": ranks}):
+            rotate(folder, self.cfg.keep_checkpoints)
+
+    def _keep_best(self, row: Mapping[str, float]) -> None:
+        """Writes the policy of a logged row if it evaluated as well as any before: by success, then by survival."""
+        if not all(key in row for key in _MERIT):
+            return
+        merit = [row[key] for key in _MERIT]
+        if merit >= self.best and self._write(
+            self.folder / "checkpoints" / BEST_FILE, self._state() | {"merit": merit}
+        ):
+            self.best = merit
+
+    def _state(self) -> dict[str, Any]:
+        """What a checkpoint holds but for the ranks' own."""
+        return {
             "config": run_container(self._config_of_run()),
             "task": self.task.name,
             "motion": self.motion_digest,
@@ -451,15 +483,17 @@ class Trainer:
             "critic": self.critic.state_dict(),
             "actor_optim": self.actor_optim.state_dict(),
             "critic_optim": self.critic_optim.state_dict(),
-            "ranks": ranks,
         }
-        path = self.folder / "checkpoints" / f"checkpoint_{self.iteration:06d}.pt"
+
+    def _write(self, path: Path, state: dict[str, Any]) -> bool:
+        """Writes a checkpoint; whether it could be."""
         try:
             save_checkpoint(path, state)
-            rotate(path.parent, self.cfg.keep_checkpoints)
         except OSError as error:
             self.lost_checkpoints += 1
             print(f"checkpoint not written, the previous one stays: {error}", file=sys.stderr)
+            return False
+        return True
 
     def _check_resume(self, state: dict[str, Any]) -> None:
         """Refuses what cannot be continued, before anything is built."""

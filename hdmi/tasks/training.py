@@ -7,13 +7,13 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
-from hdmi.evaluation.protocol import EVAL_FILE, EvalResult
-from hdmi.learning.checkpoint import checkpoints, load_checkpoint
+from hdmi.evaluation.protocol import EVAL_FILE, EvalResult, evaluation_file
+from hdmi.learning.checkpoint import best_checkpoint, checkpoints, load_checkpoint
 from hdmi.tasks.queue import run_hdmi, train_run
 from hdmi.threads import share_of_processors
 
-# Of every training of a zoo: policies are rendered when they are exported.
-_COMMON = ("video=false", "logger=csv")
+# Of every training of a zoo: policies are rendered when they are exported; every 0.6 M frames the best is kept.
+_COMMON = ("video=false", "logger=csv", "eval_interval=150", "eval_envs=128")
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,9 @@ def train_zoo(
     """Trains policies, several at a time, each in processes of its own with its share of the processors.
 
     A training has the run folder `runs/<name>`: one that is there is continued, and one that has come to its end is
-    not trained again. What was trained goes into `zoo/<name>` if it is better than what is there (`is_better`), or if
-    what is there tracked another motion.
+    not trained again. Of its last policy and the one that evaluated best on the way the better one is what was trained;
+    it goes into `zoo/<name>` if it is better than what is there (`is_better`), or if what is there tracked another
+    motion.
 
     Args:
         recipes: name of the policy -> arguments of `hdmi train`.
@@ -120,11 +121,19 @@ def _train(
         problem := run_hdmi(run, "evaluate", f"checkpoint={run}", f"num_envs={num_envs}", count)
     ):
         return Outcome(name, problem)
-    result = EvalResult.load(run / EVAL_FILE)
+    result, checkpoint = EvalResult.load(run / EVAL_FILE), run
+    best = best_checkpoint(run / "checkpoints")
+    if best is not None:
+        file = run / evaluation_file("best")
+        if problem := run_hdmi(run, "evaluate", f"checkpoint={best}", f"num_envs={num_envs}", count, f"out={file}"):
+            return Outcome(name, problem, result)
+        if is_better(EvalResult.load(file), result):
+            result, checkpoint = EvalResult.load(file), best
     before = _in_zoo(folder, run)
     if not is_better(result, before):
         return Outcome(name, "", result, before)
-    if problem := run_hdmi(run, "export", f"checkpoint={run}", f"out={folder}", f"num_envs={num_envs}", "graph=false"):
+    arguments = (f"checkpoint={checkpoint}", f"out={folder}", f"num_envs={num_envs}", "graph=false")
+    if problem := run_hdmi(run, "export", *arguments):
         return Outcome(name, problem, result, before)
     return Outcome(name, "", result, before, kept=True)
 
