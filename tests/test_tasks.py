@@ -27,6 +27,7 @@ from hdmi.assets import default_joint_pos, g1, g1_robot
 from hdmi.config import ConfigError, task_files
 from hdmi.evaluation import EvalResult
 from hdmi.evaluation.agents import BlindAgent
+from hdmi.evaluation.protocol import evaluation_config, make_evaluation_env
 from hdmi.motion import Motion, find_motion, forward_kinematics, load_motion, save_motion
 from hdmi.tasks.catalogue import list_tasks, sources
 from hdmi.tasks.check import Training, check_task, measure_contacts, measure_hold, returns
@@ -254,6 +255,18 @@ def test_folding_chair_has_its_seat_up_at_zero_and_level_when_open(motions):
         ahead.append(data.xmat[scene.object_link].reshape(3, 3)[:, 0].copy())
     assert ahead[0][2] > 0.99
     assert ahead[1][0] > 0.99
+
+
+def test_a_board_that_is_let_go_falls_onto_the_platforms_as_in_the_reference():
+    cfg = load_config("task=topple_wood_board", "reset.state.noise=null", "num_threads=1")
+    task = make_task(cfg)
+    loose = int(task.reference.contact.any(dim=1).nonzero().max()) + 1
+    env = make_evaluation_env(evaluation_config(cfg, start=loose), task, 2)
+    env.set_seed(0)
+    agent = BlindAgent("zero", env.action_spec.shape[-1])
+    error = env.rollout(50, agent, break_when_any_done=False)["next", "metrics", "object_ori_error"]  # [N, T, 1]
+    assert error.max() < 0.2  # rad; it turns by 1.3
+    assert error[:, -1].max() < 0.05
 
 
 def test_stairs_rise_in_three_steps(motions):
