@@ -30,7 +30,7 @@ from hdmi.evaluation.agents import BlindAgent
 from hdmi.evaluation.protocol import evaluation_config, make_evaluation_env
 from hdmi.motion import Motion, find_motion, forward_kinematics, load_motion, save_motion
 from hdmi.tasks.catalogue import list_tasks, sources
-from hdmi.tasks.check import Training, check_task, measure_contacts, measure_hold, returns
+from hdmi.tasks.check import Hold, Training, check_task, measure_contacts, measure_hold, returns
 from hdmi.tasks.gallery import picture_frame, render_reference
 from hdmi.workshop.validate import validate_motion
 
@@ -326,22 +326,26 @@ class TestCheck:
         motion = load_motion(find_motion("lift_box"))
         motion.body_pos_w[:, motion.body_names.index("box"), 1] += 0.5
         save_motion(motion, tmp_path / "lift_box")
-        held, missed = [], []
-        for shares, options in ((held, ()), (missed, (f"motion_root={tmp_path}",))):
+        found = []
+        for options in ((), (f"motion_root={tmp_path}",)):
             cfg = load_config(*options)
             with patch.multiple("hdmi.tasks.check", _HOLD_STARTS=2, _EPISODES=2):
-                shares += measure_hold(cfg, make_task(cfg)).tolist()
-        assert len(held) == len(missed) == 2
-        assert min(held) > 0.8
-        assert max(missed) < 0.1
+                found.append(measure_hold(cfg, make_task(cfg)))
+        held, missed = found
+        assert held.contacts.shape == held.turn.shape == missed.contacts.shape == (2,)
+        assert held.contacts.min() > 0.8
+        assert held.turn.max() < 0.2
+        assert missed.contacts.max() < 0.1
 
     def test_no_hold_without_contacts(self):
         cfg = load_config("task=walk")
-        assert not len(measure_hold(cfg, make_task(cfg)))
+        hold = measure_hold(cfg, make_task(cfg))
+        assert not len(hold.contacts)
+        assert str(hold) == ""
 
     @pytest.mark.parametrize(("shares", "problems"), [([0.3, 0.6], 1), ([0.4, 0.6], 0), ([], 0)])
     def test_a_reference_that_does_not_hold_fails(self, only_training, shares, problems):
-        with patch("hdmi.tasks.check.measure_hold", return_value=np.array(shares)):
+        with patch("hdmi.tasks.check.measure_hold", return_value=Hold(np.array(shares), np.zeros(len(shares)))):
             found = check_task("lift_box", frames=0).problems
         assert len(found) == problems
         assert all("45% of the contacts last 0.5 s" in problem for problem in found)
@@ -365,7 +369,11 @@ class TestCheck:
     def only_training(self):
         """Without a policy the task is what it is: checks that are about the training alone need not look again."""
         stub = EvalResult({"survival": {"mean": 1.0, "std": 0.0}})
-        known = {"evaluate_policy": stub, "check_env_specs": None, "measure_hold": np.array([0.4, 0.8])}
+        known = {
+            "evaluate_policy": stub,
+            "check_env_specs": None,
+            "measure_hold": Hold(np.array([0.4, 0.8]), np.zeros(2)),
+        }
         with patch.multiple("hdmi.tasks.check", **{name: lambda *_, v=value: v for name, value in known.items()}):
             yield
 

@@ -83,22 +83,42 @@ def measure_contacts(cfg: DictConfig) -> list[Contact]:
     return contacts
 
 
-def measure_hold(cfg: DictConfig, task: Task) -> np.ndarray:
-    """Share of the intended contacts that last without a policy, over half a second from frames all over the contact.
+@dataclass(frozen=True)
+class Hold:
+    """How an object is held without a policy, over half a second from frames all over the contact, in order of time.
+
+    Args:
+        contacts: share of the intended contacts that last, by start. [S]
+        turn: how far the object is turned away from the reference's in the end, mean of the episodes, rad. [S]
+
+    Examples:
+        >>> print(Hold(contacts=np.array([0.5, 1.0]), turn=np.array([0.1, 0.3])))
+        75%, 0.20 rad
+    """
+
+    contacts: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    turn: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    def __str__(self) -> str:
+        return f"{self.contacts.mean():.0%}, {self.turn.mean():.2f} rad" if len(self.contacts) else ""
+
+
+def measure_hold(cfg: DictConfig, task: Task) -> Hold:
+    """Lets servos alone hold what the reference holds.
 
     Servos follow the reference, with the torques that it asks for where the config feeds them forward, under the task's
     randomization, from the reference's own states. Where what is held slips or tips out of the hands at once, no policy
     finds out how to hold it.
 
     Returns:
-        For each start, in order of time. [S], none if no contact is labelled for so long
+        None of both if no contact is labelled for so long.
     """
     cfg = copy.deepcopy(cfg)
     cfg.reset.state.noise = None
     label = task.reference.contact.cpu().numpy()  # [T, E]
     steps = round(_HOLD_TIME / task.scene.sim.control_dt)
     lasting = [t for t in range(len(label) - steps) if label[t].any() and (label[t : t + steps + 1] == label[t]).all()]
-    shares = []
+    contacts, turn = [], []
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(cfg.seed)
         for at in np.linspace(0, len(lasting) - 1, _HOLD_STARTS if lasting else 0).round().astype(int):
@@ -106,9 +126,10 @@ def measure_hold(cfg: DictConfig, task: Task) -> np.ndarray:
             env.set_seed(cfg.seed)
             agent = BlindAgent("zero", env.action_spec.shape[-1])
             metrics = env.rollout(steps, agent, break_when_any_done=False)["next", "metrics"]
-            shares.append(float(metrics["contact_made"].sum() / metrics["contact_intended"].sum()))
+            contacts.append(float(metrics["contact_made"].sum() / metrics["contact_intended"].sum()))
+            turn.append(float(metrics["object_ori_error"][:, -1].mean()))
             env.close()
-    return np.array(shares)
+    return Hold(np.array(contacts), np.array(turn))
 
 
 @dataclass(frozen=True)
@@ -154,7 +175,7 @@ class TaskCheck:
 
     name: str
     contacts: list[Contact] = field(default_factory=list)
-    hold: np.ndarray = field(default_factory=lambda: np.zeros(0))  # see `measure_hold`
+    hold: Hold = field(default_factory=Hold)
     zero: EvalResult | None = None  # servos that follow the reference
     training: Training | None = None
     seconds: float = 0.0
@@ -209,9 +230,10 @@ def check_task(
                 f"and lost_contact allows {limit:g} m"
             )
     check.hold = measure_hold(cfg, task)
-    if task.scene.object_free_dof is not None and len(check.hold) and not check.hold.mean() >= _HELD:
+    kept = check.hold.contacts
+    if task.scene.object_free_dof is not None and len(kept) and not kept.mean() >= _HELD:
         check.problems.append(
-            f"reference: without a policy {check.hold.mean():.0%} of the contacts last {_HOLD_TIME:g} s from starts in "
+            f"reference: without a policy {kept.mean():.0%} of the contacts last {_HOLD_TIME:g} s from starts in "
             f"the middle of them, expected {_HELD:.0%}: see where hands touch the object, and whether it slips or tips"
         )
     check.zero = evaluate_policy(blind_agent("zero", cfg, task), cfg, _EPISODES, task)
@@ -278,7 +300,7 @@ def check_table(checks: Sequence[TaskCheck]) -> Table:
             mean, middle = learned.gain
             gain = f"{mean:+.2f} of {learned.before.mean():.2f}, median {middle:+.2f}, p {learned.chance:.0e}"
         table.add_row(
-            check.name, distance, gap, f"{check.hold.mean():.2f}" if len(check.hold) else "", shown("survival"),
+            check.name, distance, gap, str(check.hold), shown("survival"),
             shown("joint_error"), shown("body_error"), object_error, gain, f"{check.seconds:.0f}",
             "\n".join(check.problems) or "none",
         )  # fmt: skip
