@@ -70,9 +70,17 @@ class Task:
     starts: StartTables | None = None
 
     @cached_property
-    def joint_torque(self) -> torch.Tensor:
-        """What the reference asks of the joints, N m, see `hdmi.motion.dynamics`. [T, J]"""
-        return torch.from_numpy(reference_torque(self.scene, self.reference)).float()
+    def _torques(self) -> dict[float, torch.Tensor]:
+        return {}
+
+    def joint_torque(self, grip: float) -> torch.Tensor:
+        """What the reference asks of the joints, N m, if hands count on that share of friction. [T, J]
+
+        See `hdmi.motion.dynamics`. It is worked out once.
+        """
+        if grip not in self._torques:
+            self._torques[grip] = torch.from_numpy(reference_torque(self.scene, self.reference, grip)).float()
+        return self._torques[grip]
 
 
 def scene_parts(cfg: DictConfig) -> dict[str, Any]:
@@ -271,7 +279,7 @@ def make_transforms(cfg: DictConfig, task: Task, device: torch.device | None = N
         "reference": task.reference if device is None else task.reference.to(device),
         "starts": task.starts,
         "total_steps": cfg.total_frames // (cfg.num_envs * num_ranks()),
-        "joint_torque": lambda: task.joint_torque,  # a second of work that only some stacks need
+        "joint_torque": task.joint_torque,  # a second of work that only some stacks need
         "model": task.scene.model,
         "robot_bodies": task.scene.body_ids.tolist(),
         "effectors": task.scene.effectors,

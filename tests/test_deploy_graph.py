@@ -168,7 +168,7 @@ class TestLiftBox:
         assert not [name for name in kept if name.startswith(("assist", "early_end", "reset"))]
 
     def test_what_actions_start_from_comes_along(self, task_of, monkeypatch: pytest.MonkeyPatch):
-        monkeypatch.setattr("hdmi.assembly.reference_torque", lambda _, reference: reference.joint_pos.numpy())
+        monkeypatch.setattr("hdmi.assembly.reference_torque", lambda _, reference, grip: reference.joint_pos.numpy())
         cfg = load_config("+lever=feedforward")
         stack = make_transforms(cfg, task_of(cfg))
         without = [name for name, _ in forward_part(stack, "policy")]

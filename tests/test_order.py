@@ -207,7 +207,7 @@ def test_tasks_pass(name: str, monkeypatch: pytest.MonkeyPatch):
     """Alone, and with everything that may be added."""
     # seconds, and no node depends on them
     monkeypatch.setattr("hdmi.assembly.start_tables", lambda *_: None)
-    monkeypatch.setattr("hdmi.assembly.reference_torque", lambda _, reference: reference.joint_pos.numpy())
+    monkeypatch.setattr("hdmi.assembly.reference_torque", lambda _, reference, grip: reference.joint_pos.numpy())
     task = make_task(load_config(f"task={name}"))
     base = HumanoidObjectEnv(task.scene, 1)
     levers = [lever for lever in LEVERS if lever != "springs_object" or task.scene.object_free_dof is not None]

@@ -435,7 +435,7 @@ class TestMotion:
         (ahead,) = (t for _, t in make_transforms(cfg, task) if isinstance(t, FeedForwardTarget))
         r, robot = task.reference, task.scene.robot
         kp, kd, limit = (torch.tensor(v) for v in (robot.stiffness, robot.damping, robot.effort_limits))
-        expected = r.joint_pos + (task.joint_torque.clamp(-0.8 * limit, 0.8 * limit) + kd * r.joint_vel) / kp
+        expected = r.joint_pos + (task.joint_torque(0.5).clamp(-0.8 * limit, 0.8 * limit) + kd * r.joint_vel) / kp
         torch.testing.assert_close(ahead.targets, expected)
 
     def test_feedforward_leads_by_seconds_of_its_control_step(self, config) -> None:

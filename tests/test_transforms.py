@@ -402,7 +402,7 @@ class TestFeedForwardTarget:
         mujoco.mj_forward(model, data)
         torque = torch.from_numpy(data.qfrc_actuator + data.qfrc_passive)[scene.joint_dof].float()
         limit = torch.tensor(scene.robot.effort_limits)
-        wanted = lift_box().joint_torque[frame]
+        wanted = lift_box().joint_torque(0.5)[frame]
         assert wanted.abs().max() > 10
         close(torque, wanted.clamp(-limit, limit), 0.01)
 
@@ -429,11 +429,20 @@ class TestFeedForwardTarget:
         servos = {"servo_stiffness": [100.0] * 29, "servo_damping": [0.0] * 29, "effort_limits": [50.0] * 29}
         torque = torch.full_like(reference.joint_pos, 45.0)
         for effort, ahead in ((1.0, 0.45), (0.8, 0.4), (0.0, 0.0)):
-            term = T.FeedForwardTarget(reference, lambda: torque, **servos, effort=effort)
+            term = T.FeedForwardTarget(reference, lambda grip: torque, **servos, effort=effort)
             close(term.targets, reference.joint_pos + ahead)
         for effort in (-0.1, 1.1):
             with pytest.raises(ValueError, match=f"effort: expected a share from 0 to 1, got {effort}"):
                 T.FeedForwardTarget(reference, torque, **servos, effort=effort)
+
+    def test_torques_are_of_its_grip(self, reference):
+        servos = {"servo_stiffness": [100.0] * 29, "servo_damping": [0.0] * 29, "effort_limits": [50.0] * 29}
+        torque = torch.full_like(reference.joint_pos, 10.0)
+        for options, ahead in (({}, 0.05), ({"grip": 0.25}, 0.025)):
+            term = T.FeedForwardTarget(reference, lambda grip: grip * torque, **servos, **options)
+            close(term.targets, reference.joint_pos + ahead)
+        with pytest.raises(ValueError, match=r"grip: expected a share above 0, at most 1, got 0"):
+            T.FeedForwardTarget(reference, torque, **servos, grip=0)
 
     def test_lead_is_how_far_ahead_they_are(self, reference):
         servos = {"servo_stiffness": [100.0] * 29, "servo_damping": [0.0] * 29, "effort_limits": [50.0] * 29}

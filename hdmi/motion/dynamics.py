@@ -19,7 +19,6 @@ _SLIDING = 0.05  # m/s; from here on friction of an object opposes its sliding
 _UNSUPPORTED = 0.1  # body weights; with more than this missing there is no support to find a centre of pressure in
 _GRAVITY = 9.81
 _PATCH = 0.04  # m; radius of the patch in which a hand touches an object: it resists turning about the normal
-_GRIP = 0.5  # of the friction that a grip counts on: objects differ from world to world
 _AT_ONCE = 0.01  # m; what is farther off than the nearest surface is not pressed with it
 _BARE = 0.3  # price of a force that is no grip, against one that is missing
 _LEVER = 1.0  # m; lever arm that weighs moments against forces, on the robot
@@ -53,28 +52,28 @@ class Dynamics:
     object_force: np.ndarray  # [T] that nothing gives the object, in its weights; NaN without a free object
 
 
-def inverse_dynamics(playback: Playback, grips: bool = False) -> Dynamics:
+def inverse_dynamics(playback: Playback, grip: float | None = None) -> Dynamics:
     """Explains a motion by forces of contacts, see `Dynamics`; they bridge the `ground_gap`.
 
     Args:
-        grips: whether effectors hold the object by pressing it, with half of its friction, as far as that explains the
-            motion. Any bare force that the object needs asks for the least torques, but these let go of what is held
-            between two hands.
+        grip: share of its friction that effectors count on, which hold the object by pressing it, as far as that
+            explains the motion. None: any bare force that the object needs; that asks for the least torques, but these
+            let go of what is held between two hands.
     """
-    solver = _Solver(playback, min(playback.ground_gap, _REACH - TOUCH), grips)
+    solver = _Solver(playback, min(playback.ground_gap, _REACH - TOUCH), grip)
     qvel, qacc = playback.derivatives()
     rows = [solver.solve(t, qvel[t], qacc[t]) for t in range(playback.num_frames)]
     return Dynamics(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def reference_torque(scene: Scene, reference: Reference) -> np.ndarray:
+def reference_torque(scene: Scene, reference: Reference, grip: float = 0.5) -> np.ndarray:
     """Joint torques that a reference asks for in its scene, N m, smoothed over some frames. [T, J]
 
-    See `inverse_dynamics`, with grips; contacts that switch from one frame to the next make its torques jump.
+    See `inverse_dynamics`, with a grip; contacts that switch from one frame to the next make its torques jump.
     """
     reference = reference.to("cpu")
     playback = Playback(reference, scene, reference_qpos(scene, reference), 1 / scene.sim.control_dt)
-    torque = inverse_dynamics(playback, grips=True).torque
+    torque = inverse_dynamics(playback, grip=grip).torque
     smooth: np.ndarray = gaussian_filter1d(torque, _SMOOTHING, axis=0, mode="nearest")
     return smooth
 
@@ -84,11 +83,11 @@ class _Solver:
 
     Args:
         ground_gap: between feet and ground that forces bridge, m.
-        grips: whether effectors press and hold the object by friction, rather than give it any force.
+        grip: share of its friction by which effectors press and hold the object; None: they give it any force.
     """
 
-    def __init__(self, playback: Playback, ground_gap: float, grips: bool):
-        self.playback, self.ground_gap, self.grips = playback, ground_gap, grips
+    def __init__(self, playback: Playback, ground_gap: float, grip: float | None):
+        self.playback, self.ground_gap, self.grip = playback, ground_gap, grip
         scene = playback.scene
         model = copy(scene.model)
         model.geom_margin[:] = model.body_margin[:] = _REACH / 2  # margins of a pair add up
@@ -116,7 +115,7 @@ class _Solver:
             self.row_weight[v + 3 : v + 6] = 1 / (self.object_weight * _OBJECT_LEVER)
         if (v := scene.object_hinge_dof) is not None:
             self.row_weight[v] = 1 / (weight * _LEVER)
-        self.bare_price = _BARE / (self.object_weight or weight) if grips else 0.0
+        self.bare_price = _BARE / (self.object_weight or weight) if grip is not None else 0.0
 
     def solve(self, t: int, qvel: np.ndarray, qacc: np.ndarray) -> tuple[np.ndarray, float, bool, float, float]:
         model, data, scene = self.model, self.data, self.playback.scene
@@ -198,10 +197,10 @@ class _Solver:
                 bare = [sign * column for column in (*jacobian, turning) for sign in (1, -1)]
                 columns += bare
                 prices += [self.bare_price] * len(bare)
-                if self.grips and contact.dist < nearest[effector] + _AT_ONCE:
+                if self.grip is not None and contact.dist < nearest[effector] + _AT_ONCE:
                     edges = [*(jacobian.T @ tangent for tangent in frame[1:]), turning]
                     pressed = jacobian.T @ normal
-                    cone = [pressed + sign * _GRIP * friction * edge for edge in edges for sign in (1, -1)]
+                    cone = [pressed + sign * self.grip * friction * edge for edge in edges for sign in (1, -1)]
                     columns += cone
                     prices += [0.0] * len(cone)
                 continue

@@ -28,10 +28,11 @@ class FeedForwardTarget(FunctionTransform):
 
     Args:
         reference: what to follow.
-        joint_torque: that it asks for, N m, or what computes it. [T, J]
+        joint_torque: that it asks for, N m, or what computes it of `grip`. [T, J]
         servo_stiffness, servo_damping: of the servos, N m/rad and N m s/rad. [J]
         effort_limits: of the motors, N m. [J]
         effort: share of the limits that the torques are clipped to: the rest is the policy's.
+        grip: share of an object's friction that hands count on when they press it.
         lead: how far ahead on the motion the targets are, s; not those that the motion brings, which were sent in time.
         control_dt: s.
 
@@ -48,11 +49,12 @@ class FeedForwardTarget(FunctionTransform):
     def __init__(
         self,
         reference: Reference,
-        joint_torque: Tensor | Callable[[], Tensor],
+        joint_torque: Tensor | Callable[[float], Tensor],
         servo_stiffness: Sequence[float],
         servo_damping: Sequence[float],
         effort_limits: Sequence[float],
         effort: float = 0.8,
+        grip: float = 0.5,
         lead: float = 0.0,
         control_dt: float = 0.02,
         step_key: NestedKey = ("ref", "step"),
@@ -61,11 +63,13 @@ class FeedForwardTarget(FunctionTransform):
         super().__init__([step_key], [out_key])
         if not 0 <= effort <= 1:
             raise ValueError(f"effort: expected a share from 0 to 1, got {effort}")
+        if not 0 < grip <= 1:
+            raise ValueError(f"grip: expected a share above 0, at most 1, got {grip}")
         if lead < 0:
             raise ValueError(f"lead: expected seconds, not below 0, got {lead}")
         targets = reference.joint_target
         if targets is None:
-            torque = joint_torque() if callable(joint_torque) else joint_torque
+            torque = joint_torque(grip) if callable(joint_torque) else joint_torque
             kp, kd, limit = (
                 torch.as_tensor(values, dtype=torch.float32, device=reference.joint_pos.device)
                 for values in (servo_stiffness, servo_damping, effort_limits)
