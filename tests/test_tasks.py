@@ -324,7 +324,11 @@ class TestCheck:
 
     def test_hands_of_lift_box_hold_its_box_and_none_that_is_beside_them(self, tmp_path):
         motion = load_motion(find_motion("lift_box"))
-        motion.body_pos_w[:, motion.body_names.index("box"), 1] += 0.5
+        box = motion.body_names.index("box")
+        motion.body_pos_w[:, box, 1] += 0.5
+        yaw = 0.6 * np.arange(motion.num_frames) / motion.fps  # rad; the box does not follow
+        motion.body_quat_w[:, box] = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=-1)
+        motion.body_ang_vel_w[:, box] = 0.0
         save_motion(motion, tmp_path / "lift_box")
         found = []
         for options in ((), (f"motion_root={tmp_path}",)):
@@ -336,6 +340,7 @@ class TestCheck:
         assert held.contacts.min() > 0.8
         assert held.turn.max() < 0.2
         assert missed.contacts.max() < 0.1
+        np.testing.assert_allclose(missed.turn, 0.6 * 0.5, atol=0.02)
 
     def test_no_hold_without_contacts(self):
         cfg = load_config("task=walk")

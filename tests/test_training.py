@@ -94,6 +94,11 @@ class TestRun:
         # two minibatches in each of four iterations
         assert wanted[::2] == wanted[1::2] == pytest.approx([0.016, 0.013, 0.010, 0.007])
 
+    def test_rates_fall_no_further_than_asked(self, tmp_path: Path) -> None:
+        bounds = ("algo.desired_kl=1e-12", "algo.final_kl=1e-12", "algo.actor_lr=5e-4", "algo.min_lr=4.9e-4")
+        Trainer(config(*bounds), tmp_path).run()
+        assert {row["actor_lr"] for row in csv.DictReader((tmp_path / "metrics.csv").open())} == {"0.00049"}
+
     def test_policy_loads_and_repeats(self, trained: tuple[Trainer, Path]) -> None:
         trainer, folder = trained
         actor, cfg, info = load_policy(folder)

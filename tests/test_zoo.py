@@ -16,6 +16,7 @@ from hdmi.assembly import make_env
 from hdmi.commands import tasks
 from hdmi.config import ConfigError
 from hdmi.evaluation import EvalResult
+from hdmi.evaluation.card import export
 from hdmi.evaluation.protocol import evaluation_config
 from hdmi.learning.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from hdmi.learning.policy import load_policy
@@ -89,7 +90,8 @@ class Commands:
             self.train(Path(place), [text for text in arguments if not text.startswith("resume=")], num_envs=8)
         elif verb == "evaluate":
             policy = Path(options["checkpoint"])
-            result = evaluation(self.success[policy.name], num_envs=int(options["num_envs"]))
+            frames = load_checkpoint(policy)["frames"]
+            result = evaluation(self.success[policy.name], num_envs=int(options["num_envs"]), frames=frames)
             result.save(options.get("out", policy / "eval.json"))
         elif verb == "export":
             policy = Path(options["checkpoint"])
@@ -155,10 +157,18 @@ def test_the_best_on_the_way_may_be_better_than_the_last(
 ):
     commands = Commands({"walk": 0.9, "lift": 1.0, "best.pt": best})
     commands.train(tmp_path / "runs" / "walk", RECIPES["walk"])
-    save_checkpoint(tmp_path / "runs" / "walk" / "checkpoints" / "best.pt", {"iteration": 60})
+    file = tmp_path / "runs" / "walk" / "checkpoints" / "best.pt"
+    save_checkpoint(file, {"frames": 60, "motion": "of today"})
     outcomes = {outcome.name: outcome for outcome in run(commands)}
     assert str(outcomes["walk"]) == f"walk: success {100 * expected:.1f} %: taken over"
     assert EvalResult.load(tmp_path / "zoo" / "walk" / "eval.json")["success_rate"]["mean"] == expected
+    for name in RECIPES:
+        policy_in(tmp_path / "zoo" / name, 1.0, "of today")
+    run(commands)
+    assert commands.verbs("best.pt").count("evaluate") == 1  # known by then
+    save_checkpoint(file, {"frames": 80, "motion": "of today"})
+    run(commands)
+    assert commands.verbs("best.pt").count("evaluate") == 2
 
 
 def test_a_policy_for_another_motion_gives_way(run: Callable[..., list[Outcome]], tmp_path: Path):
@@ -244,6 +254,8 @@ def test_a_zoo_is_trained_and_shown(tmp_path: Path, capsys: pytest.CaptureFixtur
     card = (zoo / "stroll" / "README.md").read_text()
     assert "its early ends, too" in card
     assert str(tmp_path / "runs") not in card
+    export(tmp_path / "runs" / "stroll" / "checkpoints" / "best.pt", tmp_path / "best", num_envs=2)
+    assert (tmp_path / "best" / "curve.png").is_file()
     page, sheet = tmp_path / "zoo.md", tmp_path / "zoo.jpg"
     assert tasks.main(["zoo", f"markdown={page}", f"sheet={sheet}", *places]) == 0
     assert "[`stroll`](zoo/stroll)" in page.read_text()

@@ -125,7 +125,8 @@ def _train(
     best = best_checkpoint(run / "checkpoints")
     if best is not None:
         file = run / evaluation_file("best")
-        if problem := run_hdmi(run, "evaluate", f"checkpoint={best}", f"num_envs={num_envs}", count, f"out={file}"):
+        arguments = (f"checkpoint={best}", f"num_envs={num_envs}", count, f"out={file}")
+        if not _is_of(file, best, num_envs) and (problem := run_hdmi(run, "evaluate", *arguments)):
             return Outcome(name, problem, result)
         if is_better(EvalResult.load(file), result):
             result, checkpoint = EvalResult.load(file), best
@@ -153,6 +154,14 @@ def _has_ended(run: Path, recipe: Sequence[str]) -> bool:
     state = load_checkpoint(run)
     whole = EvalResult.load(run / EVAL_FILE).get("frames", 0) >= state["frames"] >= state["config"]["total_frames"]
     return whole and set(recipe) <= set(state["config"].get("overrides", ()))
+
+
+def _is_of(file: Path, checkpoint: Path, num_envs: int) -> bool:
+    """Whether a file holds the evaluation of a checkpoint over so many episodes."""
+    if not file.is_file():
+        return False
+    result = EvalResult.load(file)
+    return (result["num_envs"], result["frames"]) == (num_envs, load_checkpoint(checkpoint)["frames"])
 
 
 def _episodes(run: Path) -> int:
